@@ -1,0 +1,93 @@
+use nalgebra::{Vector2, Vector3};
+use serde::{Deserialize, Serialize};
+
+use crate::Camera;
+
+/// Length of one descriptor in bytes (RootSIFT quantized to `u8`).
+pub const DESCRIPTOR_LEN: usize = 128;
+
+/// A detected point of one image.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub struct Keypoint {
+    /// Column in pixels; the centre of the first pixel is 0.5.
+    pub x: f32,
+    /// Row in pixels; the centre of the first pixel is 0.5.
+    pub y: f32,
+    /// Diameter of the described region in pixels of the image, at this place.
+    pub size: f32,
+    /// Orientation in radians, clockwise from image right.
+    pub orientation: f32,
+    /// Expected standard deviation of the position, in pixels of the image at this place.
+    pub noise_px: f32,
+}
+
+impl Keypoint {
+    /// The position in pixels.
+    pub fn pixel(&self) -> Vector2<f64> {
+        Vector2::new(f64::from(self.x), f64::from(self.y))
+    }
+}
+
+/// Keypoints, descriptors and colours of one image, index by index.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct ImageFeatures {
+    /// Image width in pixels, after EXIF orientation.
+    pub width: u32,
+    /// Image height in pixels, after EXIF orientation.
+    pub height: u32,
+    /// The detected points.
+    pub keypoints: Vec<Keypoint>,
+    /// Row-major descriptors, `keypoints.len() × DESCRIPTOR_LEN`.
+    pub descriptors: Vec<u8>,
+    /// sRGB colour of the image at each keypoint.
+    pub colors: Vec<[u8; 3]>,
+}
+
+impl ImageFeatures {
+    /// Number of keypoints.
+    pub fn len(&self) -> usize {
+        self.keypoints.len()
+    }
+
+    /// Whether nothing was detected.
+    pub fn is_empty(&self) -> bool {
+        self.keypoints.is_empty()
+    }
+
+    /// The descriptor of one keypoint.
+    pub fn descriptor(&self, index: usize) -> &[u8] {
+        &self.descriptors[index * DESCRIPTOR_LEN..(index + 1) * DESCRIPTOR_LEN]
+    }
+
+    /// The keypoints as rays of `camera`; `None` bearings never occur for keypoints that the camera can see.
+    ///
+    /// Keypoints outside the domain of κ get the zero vector and an infinite standard deviation, so that no
+    /// estimator can use them.
+    pub fn rays(&self, camera: &Camera) -> Rays {
+        let mut rays = Rays { bearings: Vec::with_capacity(self.len()), sigmas: Vec::with_capacity(self.len()) };
+        for keypoint in &self.keypoints {
+            let pixel = keypoint.pixel();
+            match (camera.unproject(&pixel), camera.pixel_angle(&pixel)) {
+                (Some(bearing), Some(angle)) => {
+                    rays.bearings.push(bearing);
+                    rays.sigmas.push(angle * f64::from(keypoint.noise_px));
+                }
+                _ => {
+                    rays.bearings.push(Vector3::zeros());
+                    rays.sigmas.push(f64::INFINITY);
+                }
+            }
+        }
+        rays
+    }
+}
+
+/// Unit rays of one image's keypoints in its camera frame, with their angular standard deviations.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Rays {
+    /// Unit vectors in the camera frame (x right, y down, z forward).
+    pub bearings: Vec<Vector3<f64>>,
+    /// Angular standard deviation of each bearing in radians.
+    pub sigmas: Vec<f64>,
+}

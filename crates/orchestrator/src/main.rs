@@ -1,0 +1,2 @@
+//! The `setloc` program.
+fn main() {}

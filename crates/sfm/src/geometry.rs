@@ -1,0 +1,5 @@
+mod rigid;
+mod similarity;
+
+pub use rigid::Rigid;
+pub use similarity::Similarity;

@@ -1,0 +1,98 @@
+use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
+use setloc_features::Camera;
+
+use crate::{Rigid, Similarity};
+
+macro_rules! id {
+    ($name:ident, $doc:literal) => {
+        #[doc = $doc]
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[serde(transparent)]
+        pub struct $name(pub u32);
+
+        impl $name {
+            /// As an index into the dense vector it belongs to.
+            pub fn index(self) -> usize {
+                self.0 as usize
+            }
+        }
+    };
+}
+
+id!(CameraId, "Index into [`Reconstruction::cameras`].");
+id!(ImageId, "Index into [`Reconstruction::images`].");
+id!(PointId, "Index into [`Reconstruction::points`].");
+
+/// Keypoint `feature` of image `image` sees a point.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Observation {
+    /// The seeing image.
+    pub image: ImageId,
+    /// Keypoint index in that image.
+    pub feature: u32,
+}
+
+/// One input image with its pose when it is registered.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ReconstructionImage {
+    /// Name as the user knows it.
+    pub name: String,
+    /// Its camera.
+    pub camera: CameraId,
+    /// Pose, or `None` when the image is not part of this component.
+    pub world_from_camera: Option<Rigid>,
+}
+
+/// One triangulated point with its track.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ReconstructionPoint {
+    /// Position in the world frame.
+    pub position: Vector3<f64>,
+    /// sRGB.
+    pub color: [u8; 3],
+    /// Root mean square of the angular residuals in units of their standard deviations.
+    pub error_sigma: f64,
+    /// Who sees it, sorted.
+    pub track: Vec<Observation>,
+}
+
+/// One connected component of a scene or of a local model.
+///
+/// `images` lists *all* input images in input order, so that ids mean the same in every component.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Reconstruction {
+    /// Cameras with their (possibly refined) intrinsics.
+    pub cameras: Vec<Camera>,
+    /// All input images.
+    pub images: Vec<ReconstructionImage>,
+    /// Triangulated points.
+    pub points: Vec<ReconstructionPoint>,
+}
+
+impl Reconstruction {
+    /// Ids of the registered images, ascending.
+    pub fn registered(&self) -> impl Iterator<Item = ImageId> + '_ {
+        (0..self.images.len() as u32).map(ImageId).filter(|id| self.images[id.index()].world_from_camera.is_some())
+    }
+
+    /// The camera of an image.
+    pub fn camera_of(&self, image: ImageId) -> &Camera {
+        &self.cameras[self.images[image.index()].camera.index()]
+    }
+
+    /// Number of observations of all points.
+    pub fn observation_count(&self) -> usize {
+        self.points.iter().map(|point| point.track.len()).sum()
+    }
+
+    /// Moves the whole component into another frame.
+    pub fn transform(&mut self, target_from_world: &Similarity) {
+        for image in &mut self.images {
+            image.world_from_camera = image.world_from_camera.map(|pose| target_from_world.transform_pose(&pose));
+        }
+        for point in &mut self.points {
+            point.position = target_from_world.transform_point(&point.position);
+        }
+    }
+}

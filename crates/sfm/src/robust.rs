@@ -1,0 +1,1 @@
+//! Robust estimators: LO-RANSAC over the minimal solvers, scored on the sphere.

@@ -1,0 +1,1 @@
+//! Minimal and linear solvers, one per file: algebra only, no sampling and no scoring.
