@@ -4,14 +4,20 @@
 //! ray points: there is no image plane and no "in front of the camera" other than the sign of λ.
 
 mod five_point;
+mod gp3p;
+mod gp4ps;
 mod p3p;
 mod polynomial;
+mod quadrics;
+mod rotation_quadric;
 mod solutions;
 
 pub mod essential;
 pub mod triangulation;
 
 pub use five_point::five_point;
+pub use gp3p::gp3p;
+pub use gp4ps::gp4ps;
 pub use p3p::p3p;
 pub use polynomial::real_roots;
 pub use solutions::Solutions;
