@@ -3,8 +3,9 @@
 use crate::geometry::{Bounds, Hit, Ray, Solid};
 
 const LEAF_SIZE: usize = 3;
-/// Deep enough for 2³² solids: the tree is split at the median.
-const STACK_DEPTH: usize = 64;
+const BINS: usize = 12;
+/// Levels of the tree at most; below half of it nodes are split in two equal parts.
+const STACK_DEPTH: usize = 96;
 
 #[derive(Debug)]
 struct Node {
@@ -28,7 +29,7 @@ impl Hierarchy {
         let mut order: Vec<u32> = (0..solids.len() as u32).collect();
         let mut nodes = Vec::with_capacity(solids.len());
         if !order.is_empty() {
-            build(&boxes, &mut order, 0, &mut nodes);
+            build(&boxes, &mut order, 0, 0, &mut nodes);
         }
         let solids = order.iter().map(|&k| solids[k as usize].clone()).collect();
         Self { nodes, solids }
@@ -76,7 +77,7 @@ impl Hierarchy {
     }
 }
 
-fn build(boxes: &[Bounds], order: &mut [u32], offset: usize, nodes: &mut Vec<Node>) {
+fn build(boxes: &[Bounds], order: &mut [u32], offset: usize, depth: usize, nodes: &mut Vec<Node>) {
     let bounds = order.iter().skip(1).fold(boxes[order[0] as usize], |sum, &k| sum.union(&boxes[k as usize]));
     let index = nodes.len();
     if order.len() <= LEAF_SIZE {
@@ -84,13 +85,56 @@ fn build(boxes: &[Bounds], order: &mut [u32], offset: usize, nodes: &mut Vec<Nod
         return;
     }
     nodes.push(Node { bounds, first: 0, count: 0 });
-    let axis = (bounds.max - bounds.min).imax();
-    let middle = order.len() / 2;
-    order.select_nth_unstable_by(middle, |&a, &b| {
-        boxes[a as usize].center()[axis].total_cmp(&boxes[b as usize].center()[axis]).then(a.cmp(&b))
-    });
+    let middle = if depth < STACK_DEPTH / 2 { split(boxes, order) } else { order.len() / 2 };
     let (left, right) = order.split_at_mut(middle);
-    build(boxes, left, offset, nodes);
+    build(boxes, left, offset, depth + 1, nodes);
     nodes[index].first = nodes.len() as u32;
-    build(boxes, right, offset + middle, nodes);
+    build(boxes, right, offset + middle, depth + 1, nodes);
+}
+
+/// Orders solids so that the first ones, as many as returned, go to the left child: the cut of least surface area heuristic
+/// among evenly spaced ones, or the median where all centres coincide.
+fn split(boxes: &[Bounds], order: &mut [u32]) -> usize {
+    let center = |k: u32| boxes[k as usize].center();
+    let (low, high) = order
+        .iter()
+        .fold((center(order[0]), center(order[0])), |(a, b), &k| (a.inf(&center(k)), b.sup(&center(k))));
+    let mut best: Option<(f64, usize, f64)> = None;
+    for axis in 0..3 {
+        let width = high[axis] - low[axis];
+        if width <= 0.0 {
+            continue;
+        }
+        let mut bins: [Option<(Bounds, usize)>; BINS] = [None; BINS];
+        for &k in order.iter() {
+            let bin = (((center(k)[axis] - low[axis]) / width * BINS as f64) as usize).min(BINS - 1);
+            let filled =
+                bins[bin].map_or((boxes[k as usize], 1), |(sum, n)| (sum.union(&boxes[k as usize]), n + 1));
+            bins[bin] = Some(filled);
+        }
+        for cut in 1..BINS {
+            let cost = |part: &[Option<(Bounds, usize)>]| {
+                let sum = part.iter().flatten().copied().reduce(|a, b| (a.0.union(&b.0), a.1 + b.1));
+                sum.map(|(bounds, n)| half_area(&bounds) * n as f64)
+            };
+            if let (Some(left), Some(right)) = (cost(&bins[..cut]), cost(&bins[cut..]))
+                && best.is_none_or(|(least, ..)| left + right < least)
+            {
+                best = Some((left + right, axis, low[axis] + width * cut as f64 / BINS as f64));
+            }
+        }
+    }
+    if let Some((_, axis, plane)) = best {
+        order.sort_unstable_by_key(|&k| (center(k)[axis] >= plane, k));
+        let middle = order.partition_point(|&k| center(k)[axis] < plane);
+        if 0 < middle && middle < order.len() {
+            return middle;
+        }
+    }
+    order.len() / 2
+}
+
+fn half_area(bounds: &Bounds) -> f64 {
+    let size = bounds.max - bounds.min;
+    size.x * size.y + size.y * size.z + size.z * size.x
 }

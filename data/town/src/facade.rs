@@ -152,19 +152,20 @@ impl Facade {
         // Patches where plaster fell off or was repaired: blobs with sharp borders, unlike anywhere else.
         let patch = octaves(seed ^ 0xa1, u, v, footprint, 1.7, 4, 0.55);
         let other = if self.masonry == Masonry::Plaster { Masonry::Brick } else { Masonry::Plaster };
-        let cover = filtered_step(0.55, patch, 0.04 + footprint);
+        let cover = filtered_step(0.42, patch, 0.04 + footprint);
         if cover > 0.0 {
             let patched = self.masonry_albedo(other, u, v, footprint) * 0.8;
             color += (patched - color) * cover;
         }
         // Stains from four metres down to centimetres.
-        let stain = octaves(seed ^ 0xb2, u, v, footprint, 3.7, 7, 0.8);
-        color *= (1.0 + 0.17 * stain).max(0.25);
+        let stain = octaves(seed ^ 0xb2, u, v, footprint, 3.7, 7, 0.86);
+        color *= (1.0 + 0.2 * stain).max(0.22);
         let streak = value_noise(seed ^ 0xc3, u * 5.0, v * 0.35) * resolved(0.2, footprint);
         color *= 1.0 - 0.22 * streak.max(0.0);
-        // Blots: dark, sharp, sparse.
-        let blot = octaves(seed ^ 0xd4, u, v, footprint, 0.45, 3, 0.5);
-        color *= 1.0 - 0.45 * filtered_step(0.68, blot, 0.06 + footprint);
+        // Soot and lime: sharp, dense blots that a panorama resolves across the street.
+        let soot = octaves(seed ^ 0xd4, u, v, footprint, 0.62, 3, 0.6);
+        color *= 1.0 - 0.5 * filtered_step(0.5, soot, 0.05 + footprint);
+        color += (Rgb::new(0.80, 0.78, 0.72) - color) * (0.5 * filtered_step(0.55, -soot, 0.05 + footprint));
         if self.bays > 0 {
             color = self.with_trim(color, u, v, footprint);
         }

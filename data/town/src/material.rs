@@ -103,7 +103,7 @@ fn pavement(seed: u32, x: f32, y: f32, footprint: f32) -> Rgb {
     let gum = gum + 1.0 - resolved(0.1, footprint);
     let stain = octaves(seed ^ 6, x, y, footprint, 3.1, 7, 0.75);
     Rgb::new(0.42, 0.41, 0.39)
-        * (1.0 + 0.3 * tint * visible + 0.14 * stain).max(0.2)
+        * (1.0 + 0.35 * tint * visible + 0.18 * stain).max(0.2)
         * gum
         * (0.6 + 0.4 * (inside * visible + 1.0 - visible))
 }
@@ -133,7 +133,7 @@ pub fn street(seed: u32, x: f32, y: f32, is_lane: bool, across: f32, footprint: 
     let crack = octaves(seed ^ 6, x, y, footprint, 1.9, 4, 0.6).abs();
     let is_crack = (1.0 - crack / (0.02 + footprint * 0.5)).clamp(0.0, 1.0) * resolved(0.08, footprint);
     let mut color = Rgb::new(0.27, 0.27, 0.28)
-        * (1.0 + 0.17 * stain - 0.22 * patch.clamp(0.0, 1.0)).max(0.2)
+        * (1.0 + 0.21 * stain - 0.25 * patch.clamp(0.0, 1.0)).max(0.2)
         * (1.0 - 0.5 * is_crack);
     let dash = ((y + x) / 4.0).rem_euclid(1.0) * 4.0;
     let marking = filtered_band(-0.07, 0.07, across, footprint) * filtered_band(0.0, 2.2, dash, footprint);

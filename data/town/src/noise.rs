@@ -14,10 +14,16 @@ pub fn uniform(seed: u32, x: i32, y: i32) -> f32 {
     (hash(seed, x, y) >> 8) as f32 / 16_777_216.0
 }
 
+/// The integer below; `f32::floor` is a library call on processors without SSE4.1, and this is the innermost loop.
+pub fn floor(x: f32) -> i32 {
+    let truncated = x as i32;
+    truncated - i32::from(x < truncated as f32)
+}
+
 /// Value noise in [-1, 1] with lattice spacing 1.
 pub fn value_noise(seed: u32, x: f32, y: f32) -> f32 {
-    let (floor_x, floor_y) = (x.floor(), y.floor());
-    let (i, j) = (floor_x as i32, floor_y as i32);
+    let (i, j) = (floor(x), floor(y));
+    let (floor_x, floor_y) = (i as f32, j as f32);
     let fade = |t: f32| t * t * (3.0 - 2.0 * t);
     let (a, b) = (fade(x - floor_x), fade(y - floor_y));
     let low = uniform(seed, i, j) * (1.0 - a) + uniform(seed, i + 1, j) * a;

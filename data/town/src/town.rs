@@ -99,10 +99,10 @@ impl Town {
     }
 }
 
-/// A 68° lens with mild distortion and a principal point a little off the middle.
+/// A 75° lens with mild distortion and a principal point a little off the middle.
 fn photo_camera(width: u32) -> Camera {
     let (w, height) = (f64::from(width), width / 4 * 3);
-    let params = vec![0.742 * w, 0.742 * w, 0.503 * w, 0.372 * w, -0.06, 0.02, 0.0, 0.0];
+    let params = vec![0.65 * w, 0.65 * w, 0.503 * w, 0.372 * w, -0.06, 0.02, 0.0, 0.0];
     Camera { model: CameraModel::Opencv, width, height, params }
 }
 
