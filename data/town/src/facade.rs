@@ -4,7 +4,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::light::Rgb;
-use crate::noise::{filtered_band, filtered_step, hash, octaves, resolved, uniform, value_noise};
+use crate::noise::{filtered_band, filtered_step, hash, octaves, resolved, spots, uniform, value_noise};
 
 /// What fills an opening.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -166,6 +166,9 @@ impl Facade {
         let soot = octaves(seed ^ 0xd4, u, v, footprint, 0.62, 3, 0.6);
         color *= 1.0 - 0.5 * filtered_step(0.5, soot, 0.05 + footprint);
         color += (Rgb::new(0.80, 0.78, 0.72) - color) * (0.5 * filtered_step(0.55, -soot, 0.05 + footprint));
+        let chips =
+            spots(seed ^ 0x1d, u, v, footprint, 0.62) + 0.8 * spots(seed ^ 0x1e, u, v, footprint, 0.27);
+        color *= (1.0 + 0.38 * chips).max(0.25);
         if self.bays > 0 {
             color = self.with_trim(color, u, v, footprint);
         }

@@ -30,14 +30,14 @@ const CLEARANCE: f64 = 2.2;
 
 /// The photos' way: east, north, heading clockwise from north in degrees.
 const PHOTO_WAY: [[f64; 3]; 8] = [
-    [1.0, 28.5, 4.0],
-    [1.3, 30.6, 11.0],
-    [1.8, 32.7, 22.0],
-    [2.6, 34.9, 38.0],
-    [4.0, 37.0, 56.0],
-    [6.0, 38.9, 76.0],
-    [8.3, 40.2, 96.0],
-    [10.6, 41.3, 117.0],
+    [-3.2, 29.2, 60.0],
+    [-2.4, 31.1, 54.0],
+    [-1.4, 33.0, 52.0],
+    [-0.1, 34.9, 55.0],
+    [1.7, 36.7, 62.0],
+    [3.8, 38.3, 75.0],
+    [6.2, 39.8, 95.0],
+    [9.0, 41.0, 117.0],
 ];
 
 /// Where a camera stands and looks: metres and radians; heading clockwise from north.

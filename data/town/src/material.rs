@@ -2,7 +2,7 @@
 
 use crate::facade::{bill, glyph, vivid};
 use crate::light::Rgb;
-use crate::noise::{filtered_band, hash, octaves, resolved, uniform, value_noise};
+use crate::noise::{filtered_band, hash, octaves, resolved, spots, uniform, value_noise};
 
 /// The substance of a solid; seeds make each piece unlike the others.
 #[derive(Debug, Clone, Copy)]
@@ -135,6 +135,8 @@ pub fn street(seed: u32, x: f32, y: f32, is_lane: bool, across: f32, footprint: 
     let mut color = Rgb::new(0.27, 0.27, 0.28)
         * (1.0 + 0.21 * stain - 0.25 * patch.clamp(0.0, 1.0)).max(0.2)
         * (1.0 - 0.5 * is_crack);
+    color *=
+        1.0 + 0.3 * spots(seed ^ 7, x, y, footprint, 0.7) + 0.25 * spots(seed ^ 8, x, y, footprint, 0.31);
     let dash = ((y + x) / 4.0).rem_euclid(1.0) * 4.0;
     let marking = filtered_band(-0.07, 0.07, across, footprint) * filtered_band(0.0, 2.2, dash, footprint);
     let worn = marking * (0.75 + 0.35 * stain).clamp(0.0, 1.0);

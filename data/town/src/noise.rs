@@ -57,6 +57,22 @@ pub fn octaves(seed: u32, x: f32, y: f32, footprint: f32, wavelength: f32, count
     sum
 }
 
+/// Chips and spots: a disc of random place, size and height in [-1, 1] in every second cell of a square lattice, 0 elsewhere.
+pub fn spots(seed: u32, x: f32, y: f32, footprint: f32, cell: f32) -> f32 {
+    let (i, j) = (floor(x / cell), floor(y / cell));
+    let bits = hash(seed, i, j);
+    if bits & 1 == 0 {
+        return 0.0;
+    }
+    let part = |shift: u32| ((bits >> shift) & 0xff) as f32 / 255.0;
+    let radius = cell * (0.1 + 0.24 * part(1));
+    let center = |shift, low: f32| low * cell + radius + part(shift) * (cell - 2.0 * radius);
+    let distance = (x - center(9, i as f32)).hypot(y - center(17, j as f32));
+    let cover = 1.0 - filtered_step(radius, distance, footprint);
+    let height = if bits >> 25 & 1 == 1 { 1.0 } else { -1.0 };
+    height * (0.4 + 0.6 * part(24)) * cover * resolved(2.0 * radius, footprint)
+}
+
 /// A step from 0 below `edge` to 1 above it, as wide as the footprint.
 pub fn filtered_step(edge: f32, x: f32, footprint: f32) -> f32 {
     ((x - edge) / footprint.max(1e-4) + 0.5).clamp(0.0, 1.0)
