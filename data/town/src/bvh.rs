@@ -24,7 +24,7 @@ pub struct Hierarchy {
 }
 
 impl Hierarchy {
-    pub fn new(solids: Vec<Solid>) -> Self {
+    pub fn new(solids: &[Solid]) -> Self {
         let boxes: Vec<Bounds> = solids.iter().map(|solid| solid.shape.bounds()).collect();
         let mut order: Vec<u32> = (0..solids.len() as u32).collect();
         let mut nodes = Vec::with_capacity(solids.len());

@@ -68,14 +68,14 @@ const PALETTE: [[f32; 3]; 8] = [
 ];
 
 impl Facade {
-    /// Draws a façade of this width; `storeys` above the ground floor. Repeated façades share `module`'s proportions.
+    /// Draws a façade of this width with so many storeys above the ground floor; a party wall has no openings.
     pub fn draw(rng: &mut ChaCha8Rng, width: f32, storeys: u32, has_openings: bool) -> Self {
         let masonry =
             [Masonry::Brick, Masonry::Ashlar, Masonry::Plaster, Masonry::Rubble][rng.random_range(0..4)];
         let tone = rng.random_range(0.85..1.15);
         let ground_floor = rng.random_range(3.6..4.3);
         let floor_height = rng.random_range(2.9..3.3);
-        // One in four follows one of two stock designs: such façades repeat their proportions and windows.
+        // One in four follows one of two stock designs, so that streets repeat window modules as real ones do.
         let stock = rng.random_range(0..8u32);
         let (window_width, window_height, recess) = match stock {
             0 => (1.2, 1.8, 0.22),
@@ -337,7 +337,7 @@ pub fn bill(seed: u32, x: f32, y: f32, footprint: f32) -> Rgb {
     let mut color = ground + (vivid(seed ^ 3) - ground) * filtered_step(0.12, blob, 0.05 + footprint);
     let (size_x, size_y) = (0.05, 0.075);
     let (i, j) = ((x / size_x).floor(), (y / size_y).floor());
-    if hash(seed ^ 4, 0, j as i32) % 3 == 0 {
+    if hash(seed ^ 4, 0, j as i32).is_multiple_of(3) {
         let ink = glyph(hash(seed ^ 8, i as i32, j as i32), x / size_x - i, y / size_y - j);
         let visible = resolved(size_x, footprint);
         color *= 1.0 - 0.8 * (visible * f32::from(u8::from(ink)) + (1.0 - visible) * 0.3);

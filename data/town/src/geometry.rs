@@ -116,7 +116,7 @@ pub fn facade_place(bounds: &Bounds, face: u8, point: &Vector3<f64>) -> (f32, f3
 /// Outward unit normal of a box face.
 pub fn face_normal(face: u8) -> Vector3<f64> {
     let mut normal = Vector3::zeros();
-    normal[usize::from(face / 2)] = if face % 2 == 0 { -1.0 } else { 1.0 };
+    normal[usize::from(face / 2)] = if face.is_multiple_of(2) { -1.0 } else { 1.0 };
     normal
 }
 
@@ -237,7 +237,7 @@ fn recess(bounds: &Bounds, face: u8, opening: &Opening) -> Bounds {
     cut.min[along_axis] = bounds.min[along_axis] + f64::from(opening.left);
     cut.max[along_axis] = bounds.min[along_axis] + f64::from(opening.right);
     (cut.min.z, cut.max.z) = (f64::from(opening.bottom), f64::from(opening.top));
-    if face % 2 == 0 {
+    if face.is_multiple_of(2) {
         cut.max[normal_axis] = bounds.min[normal_axis] + f64::from(opening.depth);
     } else {
         cut.min[normal_axis] = bounds.max[normal_axis] - f64::from(opening.depth);
@@ -271,7 +271,7 @@ fn intersect_recess(bounds: &Bounds, ray: &Ray, entry: &Hit, face: u8, opening: 
 /// Where a ray from inside a recess leaves the façade plane, or `None` when it meets the recess's sides.
 pub fn leave_recess(bounds: &Bounds, ray: &Ray, face: u8, opening: &Opening) -> Option<Vector3<f64>> {
     let axis = usize::from(face / 2);
-    let plane = if face % 2 == 0 { bounds.min[axis] } else { bounds.max[axis] };
+    let plane = if face.is_multiple_of(2) { bounds.min[axis] } else { bounds.max[axis] };
     let distance = (plane - ray.origin[axis]) * ray.inverse[axis];
     if distance < 0.0 || !distance.is_finite() {
         return None;

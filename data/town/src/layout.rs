@@ -400,8 +400,8 @@ fn frame(
     height: f64,
     length: f64,
 ) -> (Vector3<f64>, Vector3<f64>, Vector3<f64>) {
-    let mut origin = if face % 2 == 0 { bounds.min } else { bounds.max };
-    let axis = if face < 2 { 1 } else { 0 };
+    let mut origin = if face.is_multiple_of(2) { bounds.min } else { bounds.max };
+    let axis = usize::from(face < 2);
     origin[axis] = bounds.min[axis] + left;
     origin.z = height;
     let mut along = Vector3::zeros();

@@ -54,7 +54,7 @@ impl TownParams {
             if holds { Ok(()) } else { Err(TownError::InvalidParameter { name, value, allowed }) }
         };
         let width_is_valid =
-            |width: u32, multiple: u32| (32..=8192).contains(&width) && width % multiple == 0;
+            |width: u32, multiple: u32| (32..=8192).contains(&width) && width.is_multiple_of(multiple);
         check((1..=2000).contains(&self.panoramas), "panoramas", self.panoramas.to_string(), "1 to 2000")?;
         check(
             (2.0..=10.0).contains(&self.panorama_step_m),

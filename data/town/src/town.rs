@@ -52,7 +52,7 @@ impl Town {
         params.validate()?;
         let (panoramas, photos) = (panorama_way(params), photo_way(params));
         let standpoints: Vec<Standpoint> = panoramas.iter().chain(&photos).copied().collect();
-        let hierarchy = Hierarchy::new(solids(params, &standpoints));
+        let hierarchy = Hierarchy::new(&solids(params, &standpoints));
         let panorama_camera = Camera::equirectangular(params.panorama_width, params.panorama_width / 2);
         let photo_camera = photo_camera(params.photo_width);
         panorama_camera.validate()?;

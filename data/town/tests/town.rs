@@ -1,10 +1,15 @@
 //! What the rendered sample promises to those who build on it.
 
+// Helpers of tests are tests: a failure in them is the test failing.
+#![allow(clippy::unwrap_used)]
+
 use std::collections::BTreeMap;
 
 use nalgebra::{Vector2, Vector3};
 use setloc_features::Camera;
-use setloc_town::{PHOTO_SET, Town, TownParams, View, write_dataset};
+use setloc_town::{PHOTO_SET, Town, TownParams, VERSION, View, write_dataset};
+
+const GOLDEN_MEANS: [f64; 8] = [178.8, 167.1, 158.6, 153.6, 121.5, 131.5, 109.8, 112.2];
 
 fn tiny() -> TownParams {
     TownParams { panorama_width: 64, photo_width: 64, ..TownParams::default() }
@@ -164,4 +169,20 @@ fn a_written_data_set_reads_back_as_the_town() {
     let origin: f64 = truth["geo_origin"]["lat"].as_f64().unwrap();
     // 111.2 km per degree of latitude there; the panorama stands 35 m north of the origin.
     assert!(((lat - origin) * 111_200.0 - town.views()[0].center_in_world.y).abs() < 0.1);
+}
+
+/// Fails when the picture changes: then raise `VERSION`, so that caches of rendered towns expire, and renew the numbers.
+#[test]
+fn version_names_this_picture() {
+    let view = Town::new(&tiny()).unwrap().render(0).unwrap();
+    // Means over 16 × 16 pixel tiles, not bytes: mathematical libraries differ in the last digit.
+    let mut means = [0.0; 8];
+    for (k, pixel) in view.rgb.chunks_exact(3).enumerate() {
+        let (x, y) = (k % 64, k / 64);
+        means[x / 16 + 4 * (y / 16)] += pixel.iter().map(|&c| f64::from(c)).sum::<f64>() / (3.0 * 256.0);
+    }
+    assert_eq!(VERSION, 1);
+    for (mean, expected) in means.iter().zip(GOLDEN_MEANS) {
+        assert!((mean - expected).abs() < 0.5, "{means:.1?}");
+    }
 }
