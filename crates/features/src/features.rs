@@ -65,7 +65,8 @@ impl ImageFeatures {
     /// Keypoints outside the domain of κ get the zero vector and an infinite standard deviation, so that no
     /// estimator can use them.
     pub fn rays(&self, camera: &Camera) -> Rays {
-        let mut rays = Rays { bearings: Vec::with_capacity(self.len()), sigmas: Vec::with_capacity(self.len()) };
+        let mut rays =
+            Rays { bearings: Vec::with_capacity(self.len()), sigmas: Vec::with_capacity(self.len()) };
         for keypoint in &self.keypoints {
             let pixel = keypoint.pixel();
             match (camera.unproject(&pixel), camera.pixel_angle(&pixel)) {
