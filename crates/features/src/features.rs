@@ -6,6 +6,9 @@ use crate::Camera;
 /// Length of one descriptor in bytes (RootSIFT quantized to `u8`).
 pub const DESCRIPTOR_LEN: usize = 128;
 
+/// Euclidean length of a stored descriptor, up to rounding and clipping of single components at 255.
+pub const DESCRIPTOR_NORM: u16 = 512;
+
 /// A detected point of one image.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
