@@ -5,13 +5,22 @@
 //! two-nearest-neighbour matching of two images. It knows nothing of poses, files or caches.
 
 mod camera;
+mod decode;
 mod error;
+mod extract;
 mod features;
+mod mask;
 mod matching;
 
 pub use camera::{Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole, ProjectJacobian, UnprojectJacobian};
+pub use decode::{
+    CameraSource, DecodeLimits, DecodedImage, GPano, GeoPosition, ImageInfo, ImageMetadata, decode,
+    guess_camera, probe,
+};
 pub use error::FeatureError;
+pub use extract::{FeatureParams, extract, keypoint_noise_px};
 pub use features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Keypoint, Rays};
+pub use mask::Mask;
 pub use matching::{
     DescriptorBlock, GuidedParams, Match, MatchParams, TwoNearest, match_features, match_guided, two_nearest,
 };

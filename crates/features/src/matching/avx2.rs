@@ -129,8 +129,9 @@ mod x86 {
         let mut products = [[_mm256_setzero_si256(); VECTORS]; ROWS];
         for (step, (left, right)) in left.iter().zip(right).enumerate() {
             // SAFETY: both are 32 readable bytes.
-            let vectors =
-                unsafe { [_mm256_loadu_si256(left.as_ptr().cast()), _mm256_loadu_si256(right.as_ptr().cast())] };
+            let vectors = unsafe {
+                [_mm256_loadu_si256(left.as_ptr().cast()), _mm256_loadu_si256(right.as_ptr().cast())]
+            };
             for row in 0..ROWS {
                 let query = _mm256_set1_epi32(queries[row][step % STEPS]);
                 for vector in 0..VECTORS {

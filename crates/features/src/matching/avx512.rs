@@ -123,8 +123,9 @@ mod x86 {
         let mut products = [[_mm512_setzero_si512(); VECTORS]; ROWS];
         for (step, (left, right)) in left.iter().zip(right).enumerate() {
             // SAFETY: a line is 64 readable bytes.
-            let vectors =
-                unsafe { [_mm512_loadu_si512(left.0.as_ptr().cast()), _mm512_loadu_si512(right.0.as_ptr().cast())] };
+            let vectors = unsafe {
+                [_mm512_loadu_si512(left.0.as_ptr().cast()), _mm512_loadu_si512(right.0.as_ptr().cast())]
+            };
             for row in 0..ROWS {
                 let query = _mm512_set1_epi32(queries[row][step % STEPS]);
                 products[row][0] = _mm512_dpbusd_epi32(products[row][0], vectors[0], query);

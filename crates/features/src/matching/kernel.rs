@@ -155,7 +155,11 @@ pub struct DescriptorBlock {
 
 impl std::fmt::Debug for DescriptorBlock {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        formatter.debug_struct("DescriptorBlock").field("kernel", &self.kernel).field("len", &self.len).finish()
+        formatter
+            .debug_struct("DescriptorBlock")
+            .field("kernel", &self.kernel)
+            .field("len", &self.len)
+            .finish()
     }
 }
 
@@ -261,8 +265,7 @@ fn search_scalar(queries: &PackedQueries, base: &PackedBase, rows: &mut Slots, c
     let query_bytes: &[u8] = bytemuck::cast_slice(&queries.lines);
     for (row, query) in query_bytes.chunks_exact(DESCRIPTOR_LEN).enumerate() {
         for (column, candidate) in base_bytes.chunks_exact(DESCRIPTOR_LEN).enumerate() {
-            let product: i32 =
-                query.iter().zip(candidate).map(|(&a, &b)| i32::from(a) * i32::from(b)).sum();
+            let product: i32 = query.iter().zip(candidate).map(|(&a, &b)| i32::from(a) * i32::from(b)).sum();
             let distance2 = queries.terms[row] + base.terms[column] - 2 * product;
             rows.update(row, distance2, column);
             columns.update(column, distance2, row);

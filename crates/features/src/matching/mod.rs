@@ -10,7 +10,20 @@ pub use guided::{GuidedParams, match_guided};
 pub use kernel::{DescriptorBlock, TwoNearest, two_nearest};
 
 /// A putative or verified match: keypoint `first` of one image shows what keypoint `second` of another shows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, bytemuck::Pod, bytemuck::Zeroable)]
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Hash,
+    Serialize,
+    Deserialize,
+    bytemuck::Pod,
+    bytemuck::Zeroable,
+)]
 #[repr(C)]
 pub struct Match {
     /// Keypoint index in the first image.
@@ -166,9 +179,8 @@ mod tests {
         far[..40].iter_mut().for_each(|value| *value += 20);
         let first = features([far, near].concat());
         let second = features([base, random(&mut rng, 5)].concat());
-        let with = |mutual| {
-            match_features(&MatchParams { mutual, ..MatchParams::default() }, &first, &second)
-        };
+        let with =
+            |mutual| match_features(&MatchParams { mutual, ..MatchParams::default() }, &first, &second);
         assert_eq!(with(true), [Match { first: 1, second: 0 }]);
         assert_eq!(with(false), [Match { first: 0, second: 0 }, Match { first: 1, second: 0 }]);
     }
