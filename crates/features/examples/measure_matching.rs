@@ -1,6 +1,8 @@
 //! Features and matches of consecutive images of a data set, judged by its exact poses where it has them.
 //!
-//! `cargo run --release -p setloc-features --example measure_matching -- DATASET/panoramas [DATASET/truth.json]`
+//! Reads `cameras.json` beside `truth.json`; without truth, cameras are guessed.
+//!
+//! `cargo run --release -p setloc-features --example measure_matching -- DATASET/panoramas [DATASET/truth.json [CONTRAST]]`
 
 #![allow(clippy::print_stdout, reason = "a report for people")]
 
@@ -11,11 +13,11 @@ use std::time::Instant;
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use serde_json::Value;
 use setloc_features::{
-    DecodeLimits, FeatureParams, GuidedParams, ImageFeatures, ImageInfo, Match, MatchParams, Rays, decode,
-    extract, guess_camera, match_features, match_guided,
+    Camera, DecodeLimits, FeatureParams, GuidedParams, ImageFeatures, ImageInfo, Match, MatchParams, Rays,
+    decode, extract, guess_camera, match_features, match_guided,
 };
 
-/// A match further than this many σ from its epipolar plane is wrong.
+/// A match further than this from its epipolar plane is wrong.
 const MAX_ANGLE_DEG: f64 = 0.25;
 
 struct Image {
@@ -31,25 +33,41 @@ fn main() -> Result<(), Box<dyn Error>> {
         Some(path) => Some(serde_json::from_slice(&std::fs::read(path)?)?),
         None => None,
     };
+    let cameras: Option<Value> =
+        match arguments.get(2).map(|path| Path::new(path).with_file_name("cameras.json")) {
+            Some(path) => Some(serde_json::from_slice(&std::fs::read(path)?)?),
+            None => None,
+        };
     let mut paths: Vec<_> =
         std::fs::read_dir(folder)?.map(|entry| entry.map(|entry| entry.path())).collect::<Result<_, _>>()?;
     paths.sort();
+    let mut params = FeatureParams::default();
+    if let Some(contrast) = arguments.get(3) {
+        params.contrast_threshold = contrast.parse()?;
+    }
     let mut images = Vec::new();
     for path in paths {
+        let set = folder.file_name().unwrap_or_default().to_string_lossy();
+        let name = format!("{set}/{}", path.file_name().unwrap_or_default().to_string_lossy());
         let begin = Instant::now();
-        let image = decode(&std::fs::read(&path)?, &DecodeLimits::default())?;
+        let image = match decode(&std::fs::read(&path)?, &DecodeLimits::default()) {
+            Ok(image) => image,
+            Err(error) => {
+                println!("{name}: skipped, {error}");
+                continue;
+            }
+        };
         let decoded = begin.elapsed();
         let info = ImageInfo { width: image.width, height: image.height, metadata: image.metadata.clone() };
-        let (camera, source) = guess_camera(&info);
-        let features = extract(&FeatureParams::default(), &image, &camera, None)?;
-        let folder = folder.file_name().unwrap_or_default().to_string_lossy();
-        let name = format!("{folder}/{}", path.file_name().unwrap_or_default().to_string_lossy());
+        let (guess, source) = guess_camera(&info);
+        let camera = cameras.as_ref().and_then(|cameras| known_camera(cameras, &name)).unwrap_or(guess);
+        let features = extract(&params, &image, &camera, None)?;
         println!(
             "{name} {}×{} {source}: {} keypoints, decode {decoded:.0?}, extract {:.0?}",
             image.width,
             image.height,
             features.len(),
-            begin.elapsed() - decoded
+            begin.elapsed().saturating_sub(decoded)
         );
         let rays = features.rays(&camera);
         images.push(Image { name, features, rays });
@@ -131,4 +149,9 @@ fn essential(truth: &Value, first: &str, second: &str) -> Option<Matrix3<f64>> {
     let rotation = second_rotation.inverse() * first_rotation;
     let translation = second_rotation.inverse() * (first_center - second_center);
     Some(translation.normalize().cross_matrix() * rotation.to_rotation_matrix().matrix())
+}
+
+fn known_camera(cameras: &Value, name: &str) -> Option<Camera> {
+    let key = cameras["images"][name].as_str()?;
+    serde_json::from_value(cameras["cameras"][key].clone()).ok()
 }

@@ -72,15 +72,12 @@ impl ImageFeatures {
             Rays { bearings: Vec::with_capacity(self.len()), sigmas: Vec::with_capacity(self.len()) };
         for keypoint in &self.keypoints {
             let pixel = keypoint.pixel();
-            match (camera.unproject(&pixel), camera.pixel_angle(&pixel)) {
-                (Some(bearing), Some(angle)) => {
-                    rays.bearings.push(bearing);
-                    rays.sigmas.push(angle * f64::from(keypoint.noise_px));
-                }
-                _ => {
-                    rays.bearings.push(Vector3::zeros());
-                    rays.sigmas.push(f64::INFINITY);
-                }
+            if let Some((bearing, angle)) = camera.unproject(&pixel).zip(camera.pixel_angle(&pixel)) {
+                rays.bearings.push(bearing);
+                rays.sigmas.push(angle * f64::from(keypoint.noise_px));
+            } else {
+                rays.bearings.push(Vector3::zeros());
+                rays.sigmas.push(f64::INFINITY);
             }
         }
         rays

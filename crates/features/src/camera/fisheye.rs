@@ -86,11 +86,9 @@ pub(super) fn undistort_with_jacobian(point: &Vector2<f64>, terms: &[f64; 4]) ->
 }
 
 fn visible_angle(rho: f64, z: f64, terms: &[f64; 4]) -> Option<f64> {
-    if rho == 0.0 && z.is_nan() || rho == 0.0 && z <= 0.0 {
-        return None;
-    }
     let theta = rho.atan2(z);
-    (theta < PI && theta <= domain_end(theta, terms)).then_some(theta)
+    // The length test drops the zero vector, whose angle would be that of the optical axis.
+    (rho.max(z.abs()) > 0.0 && theta < PI && theta <= domain_end(theta, terms)).then_some(theta)
 }
 
 fn curve(theta: f64, &[k1, k2, k3, k4]: &[f64; 4]) -> f64 {
@@ -138,7 +136,9 @@ fn domain_end(needed: f64, terms: &[f64; 4]) -> f64 {
 fn invert(radius: f64, terms: &[f64; 4]) -> Option<f64> {
     let mut low = 0.0;
     let mut high = domain_end(PI, terms);
-    if !(radius <= curve(high, terms)) || (high >= PI && radius >= curve(PI, terms)) {
+    let border = curve(high, terms);
+    let is_inside = radius < border || (radius == border && high < PI);
+    if !is_inside {
         return None;
     }
     let mut theta = radius.min(high);

@@ -64,8 +64,7 @@ struct Scan<'a> {
 fn scan(bytes: &[u8]) -> Scan<'_> {
     let mut found = Scan { size: None, app1: Vec::new(), data: None, ended: false };
     let mut at = 2;
-    loop {
-        let Some((marker, payload)) = next_marker(bytes, at) else { break };
+    while let Some((marker, payload)) = next_marker(bytes, at) {
         // Markers without a segment.
         if matches!(marker, 0x01 | 0xD0..=0xD8) {
             at = payload;

@@ -117,8 +117,8 @@ impl ImageMetadata {
 
 fn number(exif: &Exif, tag: Tag) -> Option<f64> {
     match &exif.get_field(tag, In::PRIMARY)?.value {
-        Value::Rational(values) => values.first().map(|value| value.to_f64()),
-        Value::SRational(values) => values.first().map(|value| value.to_f64()),
+        Value::Rational(values) => values.first().map(exif::Rational::to_f64),
+        Value::SRational(values) => values.first().map(exif::SRational::to_f64),
         value => value.get_uint(0).map(f64::from),
     }
     .filter(|value| value.is_finite())
@@ -133,7 +133,7 @@ fn text(exif: &Exif, tag: Tag) -> Option<String> {
 fn read_gps(exif: &Exif) -> Option<GeoPosition> {
     let degrees = |tag, reference, negative: char| {
         let Value::Rational(parts) = &exif.get_field(tag, In::PRIMARY)?.value else { return None };
-        let part = |index: usize| parts.get(index).map_or(0.0, |value| value.to_f64());
+        let part = |index: usize| parts.get(index).map_or(0.0, exif::Rational::to_f64);
         let value = part(0) + part(1) / 60.0 + part(2) / 3600.0;
         let sign =
             if text(exif, reference).is_some_and(|text| text.starts_with(negative)) { -1.0 } else { 1.0 };

@@ -59,7 +59,9 @@ fn exif(main: &[(u16, u16, &[u32])], sub: &[(u16, u16, &[u32])], gps: &[(u16, u1
                 tiff.extend((values.len() as u32 / 2).to_le_bytes());
                 tiff.extend((data_at as u32).to_le_bytes());
                 data_at += values.len() * 4;
-                values.iter().for_each(|value| data.extend(value.to_le_bytes()));
+                for value in values {
+                    data.extend(value.to_le_bytes());
+                }
             } else {
                 tiff.extend((if *kind == 2 { 2u32 } else { 1 }).to_le_bytes());
                 tiff.extend(values[0].to_le_bytes());

@@ -159,7 +159,7 @@ impl std::fmt::Debug for DescriptorBlock {
             .debug_struct("DescriptorBlock")
             .field("kernel", &self.kernel)
             .field("len", &self.len)
-            .finish()
+            .finish_non_exhaustive()
     }
 }
 
