@@ -1,7 +1,7 @@
 use std::cmp::Ordering;
 use std::sync::Once;
 
-use opencv::core::{KeyPoint, Mat, Vector, no_array};
+use opencv::core::{KeyPoint, Mat, Size, Vector, no_array};
 use opencv::features2d::SIFT;
 use opencv::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -17,6 +17,9 @@ use crate::{
 pub struct FeatureParams {
     /// Most keypoints per image.
     pub max_features: usize,
+    /// Longest side in pixels at which points are detected; larger images are reduced first. Detection of a
+    /// 4096 × 2048 panorama takes about 2 GB, in proportion to its pixels.
+    pub max_side: u32,
     /// Least contrast of a keypoint, as OpenCV scales it; lower gives more and weaker points.
     pub contrast_threshold: f64,
     /// Largest ratio of principal curvatures; lower drops more points on edges.
@@ -50,6 +53,7 @@ impl FeatureParams {
             "1 to 1000000",
             (1..=1_000_000).contains(&self.max_features),
         )?;
+        check("max_side", self.max_side.into(), "32 to 32768", (32..=32_768).contains(&self.max_side))?;
         positive("contrast_threshold", self.contrast_threshold)?;
         positive("edge_threshold", self.edge_threshold)?;
         check("octave_layers", self.octave_layers.into(), "1 to 10", (1..=10).contains(&self.octave_layers))?;
@@ -68,6 +72,7 @@ impl Default for FeatureParams {
     fn default() -> Self {
         Self {
             max_features: 8192,
+            max_side: 4096,
             contrast_threshold: 0.04,
             edge_threshold: 10.0,
             octave_layers: 3,
@@ -80,7 +85,7 @@ impl Default for FeatureParams {
 
 /// Columns repeated beyond the seam, as a share of the width: keypoints up to about 1/40 of the width across are
 /// described from the same pixels as anywhere else.
-const SEAM_SHARE: u32 = 24;
+const SEAM_SHARE: usize = 24;
 /// Cells along the longer side of the grid that spreads keypoints.
 const CELLS: usize = 16;
 /// OpenCV enlarges the image twice by linear interpolation, which puts pixel x at 2x + ½, but halves coordinates as
@@ -123,12 +128,16 @@ pub fn extract(
             height: camera.height,
         });
     }
-    let padding = if camera.wraps_around() { width / SEAM_SHARE } else { 0 };
-    let (keypoints, descriptors) = detect(params, &grey(image, padding), width + 2 * padding, height)?;
+    let grey = Grey::new(image).reduced(params.max_side)?;
+    let scale_x = width as f32 / grey.width as f32;
+    let scale_y = height as f32 / grey.height as f32;
+    let padding = if camera.wraps_around() { grey.width / SEAM_SHARE } else { 0 };
+    let (keypoints, descriptors) = detect(params, &grey.wrapped(padding))?;
 
     let mut candidates: Vec<Candidate> = Vec::with_capacity(keypoints.len());
     for (row, keypoint) in keypoints.iter().enumerate() {
-        let (x, y) = (keypoint.pt().x + CENTER_OFFSET - padding as f32, keypoint.pt().y + CENTER_OFFSET);
+        let x = (keypoint.pt().x + CENTER_OFFSET - padding as f32) * scale_x;
+        let y = (keypoint.pt().y + CENTER_OFFSET) * scale_y;
         let inside = (0.0..width as f32).contains(&x) && (0.0..height as f32).contains(&y);
         if !inside || mask.is_some_and(|mask| !mask.allows(x, y, width, height)) {
             continue;
@@ -169,9 +178,9 @@ pub fn extract(
         features.keypoints.push(Keypoint {
             x: candidate.x,
             y: candidate.y,
-            size: keypoint.size(),
+            size: keypoint.size() * scale_x,
             orientation: keypoint.angle().to_radians(),
-            noise_px: keypoint_noise_px(keypoint.size()),
+            noise_px: keypoint_noise_px(keypoint.size()) * scale_x,
         });
         push_root_sift(descriptor, &mut features.descriptors);
     }
@@ -194,33 +203,65 @@ struct Candidate {
     response: f32,
 }
 
-/// Luma of ITU-R BT.601 in 14-bit integers, with `padding` columns of the other side left and right.
-fn grey(image: &DecodedImage, padding: u32) -> Vec<u8> {
-    let (width, padding) = (image.width as usize, padding as usize);
-    let stride = width + 2 * padding;
-    let mut grey = vec![0; stride * image.height as usize];
-    for (target, source) in grey.chunks_exact_mut(stride).zip(image.rgb.chunks_exact(width * 3)) {
-        for (value, pixel) in target[padding..padding + width].iter_mut().zip(source.chunks_exact(3)) {
-            let luma = 4899 * u32::from(pixel[0]) + 9617 * u32::from(pixel[1]) + 1868 * u32::from(pixel[2]);
-            *value = ((luma + (1 << 13)) >> 14) as u8;
-        }
-        target.copy_within(width..width + padding, 0);
-        target.copy_within(padding..2 * padding, padding + width);
-    }
-    grey
+/// A grey image for the detector.
+struct Grey {
+    width: usize,
+    height: usize,
+    values: Vec<u8>,
 }
 
-fn detect(
-    params: &FeatureParams,
-    grey: &[u8],
-    width: u32,
-    height: u32,
-) -> Result<(Vector<KeyPoint>, Mat), FeatureError> {
+impl Grey {
+    /// Luma of ITU-R BT.601 in 14-bit integers.
+    fn new(image: &DecodedImage) -> Self {
+        let luma = |pixel: &[u8]| {
+            let sum = 4899 * u32::from(pixel[0]) + 9617 * u32::from(pixel[1]) + 1868 * u32::from(pixel[2]);
+            ((sum + (1 << 13)) >> 14) as u8
+        };
+        let values = image.rgb.chunks_exact(3).map(luma).collect();
+        Self { width: image.width as usize, height: image.height as usize, values }
+    }
+
+    /// Reduced by averaging so that no side is longer than `max_side`.
+    fn reduced(self, max_side: u32) -> Result<Self, FeatureError> {
+        let longer = self.width.max(self.height);
+        if longer <= max_side as usize {
+            return Ok(self);
+        }
+        let share = f64::from(max_side) / longer as f64;
+        let side = |side: usize| ((side as f64 * share).round() as usize).max(1);
+        let (width, height) = (side(self.width), side(self.height));
+        let mut values = vec![0; width * height];
+        let mut run = || {
+            let source = Mat::new_rows_cols_with_data(self.height as i32, self.width as i32, &self.values)?;
+            let mut target = Mat::new_rows_cols_with_data_mut(height as i32, width as i32, &mut values)?;
+            let size = Size::new(width as i32, height as i32);
+            opencv::imgproc::resize(&source, &mut target, size, 0.0, 0.0, opencv::imgproc::INTER_AREA)
+        };
+        run().map_err(|error| detector_error(&error))?;
+        Ok(Self { width, height, values })
+    }
+
+    /// With `padding` columns of the other side left and right.
+    fn wrapped(self, padding: usize) -> Self {
+        if padding == 0 {
+            return self;
+        }
+        let mut values = Vec::with_capacity((self.width + 2 * padding) * self.height);
+        for row in self.values.chunks_exact(self.width) {
+            values.extend_from_slice(&row[self.width - padding..]);
+            values.extend_from_slice(row);
+            values.extend_from_slice(&row[..padding]);
+        }
+        Self { width: self.width + 2 * padding, height: self.height, values }
+    }
+}
+
+fn detect(params: &FeatureParams, grey: &Grey) -> Result<(Vector<KeyPoint>, Mat), FeatureError> {
     let mut result = Ok(());
     SINGLE_THREADED.call_once(|| result = opencv::core::set_num_threads(1));
     result.map_err(|error| detector_error(&error))?;
     let run = || -> opencv::Result<(Vector<KeyPoint>, Mat)> {
-        let image = Mat::new_rows_cols_with_data(height as i32, width as i32, grey)?;
+        let image = Mat::new_rows_cols_with_data(grey.height as i32, grey.width as i32, &grey.values)?;
         let mut sift = SIFT::create(
             0,
             params.octave_layers as i32,
@@ -389,6 +430,16 @@ mod tests {
             extract(&FeatureParams::default(), &blobs(240, 200, &centers), &photo(240, 200), None).unwrap();
         for center in centers {
             assert!(nearest(&features, center) < 0.05, "{center:?}: {}", nearest(&features, center));
+        }
+    }
+
+    #[test]
+    fn reduced_images_give_keypoints_in_full_pixels() {
+        let centers = [[60.5, 70.5], [130.3, 60.8], [90.75, 140.25]];
+        let params = FeatureParams { max_side: 160, ..FeatureParams::default() };
+        let features = extract(&params, &blobs(240, 200, &centers), &photo(240, 200), None).unwrap();
+        for center in centers {
+            assert!(nearest(&features, center) < 0.1, "{center:?}: {}", nearest(&features, center));
         }
     }
 
