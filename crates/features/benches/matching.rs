@@ -1,0 +1,105 @@
+//! Matcher throughput in multiply-adds per second against the processor's own peak, measured in the same run.
+//!
+//! Read criterion's `thrpt`: one element is one u8 multiply-add, so Gelem/s are GMAC/s.
+
+use std::hint::black_box;
+
+use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use setloc_features::{DESCRIPTOR_LEN, ImageFeatures, MatchParams, match_features, two_nearest};
+
+/// Descriptors of random directions with the stored norm, as RootSIFT's are.
+fn random_features(seed: u64, count: usize) -> ImageFeatures {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut descriptors = Vec::with_capacity(count * DESCRIPTOR_LEN);
+    for _ in 0..count {
+        let values: Vec<f32> = (0..DESCRIPTOR_LEN).map(|_| rng.random::<f32>().powi(2)).collect();
+        let norm = values.iter().map(|value| value * value).sum::<f32>().sqrt();
+        descriptors.extend(values.iter().map(|value| (value / norm * 512.0).round() as u8));
+    }
+    ImageFeatures {
+        keypoints: vec![bytemuck::Zeroable::zeroed(); count],
+        descriptors,
+        ..ImageFeatures::default()
+    }
+}
+
+/// The fastest u8 multiply-add loop this processor can run: independent accumulators, no memory.
+#[cfg(target_arch = "x86_64")]
+mod peak {
+    use std::arch::x86_64::{
+        __m256i, __m512i, _mm256_add_epi32, _mm256_madd_epi16, _mm256_set1_epi32, _mm256_setzero_si256,
+        _mm512_dpbusd_epi32, _mm512_set1_epi32, _mm512_setzero_si512,
+    };
+    use std::hint::black_box;
+
+    pub const STEPS: u64 = 1 << 18;
+    const ACCUMULATORS: usize = 12;
+
+    /// Name of the instruction, multiply-adds per call, and the loop.
+    pub fn best() -> Option<(&'static str, u64, fn())> {
+        let loops = STEPS * ACCUMULATORS as u64;
+        if std::arch::is_x86_feature_detected!("avx512vnni")
+            && std::arch::is_x86_feature_detected!("avx512bw")
+        {
+            // SAFETY: the instructions are there, as just checked.
+            Some(("vpdpbusd zmm", loops * 64, || unsafe { vnni() }))
+        } else if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the instructions are there, as just checked.
+            Some(("vpmaddwd ymm", loops * 16, || unsafe { madd() }))
+        } else {
+            None
+        }
+    }
+
+    #[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
+    fn vnni() {
+        let (a, b) = (_mm512_set1_epi32(black_box(0x0102_0304)), _mm512_set1_epi32(black_box(0x0506_0708)));
+        let mut sums: [__m512i; ACCUMULATORS] = [_mm512_setzero_si512(); ACCUMULATORS];
+        for _ in 0..STEPS {
+            for sum in &mut sums {
+                *sum = _mm512_dpbusd_epi32(*sum, a, b);
+            }
+        }
+        black_box(sums);
+    }
+
+    #[target_feature(enable = "avx2")]
+    fn madd() {
+        let (a, b) = (_mm256_set1_epi32(black_box(0x0002_0003)), _mm256_set1_epi32(black_box(0x0005_0006)));
+        let mut sums: [__m256i; ACCUMULATORS] = [_mm256_setzero_si256(); ACCUMULATORS];
+        for _ in 0..STEPS {
+            for sum in &mut sums {
+                // The factor depends on the sum, so that the product cannot be taken out of the loop.
+                *sum = _mm256_add_epi32(*sum, _mm256_madd_epi16(*sum, a));
+            }
+        }
+        black_box((sums, b));
+    }
+}
+
+fn matching(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("matching");
+    group.sample_size(20);
+    #[cfg(target_arch = "x86_64")]
+    if let Some((name, multiply_adds, run)) = peak::best() {
+        group.throughput(Throughput::Elements(multiply_adds));
+        group.bench_function(format!("peak {name}"), |bencher| bencher.iter(run));
+    }
+    for count in [1024, 8192] {
+        let (first, second) = (random_features(1, count), random_features(2, count));
+        group.throughput(Throughput::Elements((count * count * DESCRIPTOR_LEN) as u64));
+        group.bench_function(format!("two_nearest {count}×{count}"), |bencher| {
+            bencher.iter(|| two_nearest(black_box(&first.descriptors), black_box(&second.descriptors)));
+        });
+        group.bench_function(format!("match_features mutual {count}×{count}"), |bencher| {
+            let params = MatchParams::default();
+            bencher.iter(|| match_features(&params, black_box(&first), black_box(&second)));
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, matching);
+criterion_main!(benches);

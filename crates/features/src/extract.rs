@@ -1,0 +1,563 @@
+use std::cmp::Ordering;
+use std::sync::Once;
+
+use opencv::core::{KeyPoint, Mat, Size, Vector, no_array};
+use opencv::features2d::SIFT;
+use opencv::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::error::check;
+use crate::{
+    Camera, DESCRIPTOR_LEN, DESCRIPTOR_NORM, DecodedImage, FeatureError, ImageFeatures, Keypoint, Mask,
+};
+
+/// How to detect and describe points.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FeatureParams {
+    /// Most keypoints per image.
+    pub max_features: usize,
+    /// Longest side in pixels at which points are detected; larger images are reduced first. Detection of a
+    /// 4096 × 2048 panorama takes about 2 GB, in proportion to its pixels.
+    pub max_side: u32,
+    /// Least contrast of a keypoint, as OpenCV scales it; lower gives more and weaker points.
+    pub contrast_threshold: f64,
+    /// Largest ratio of principal curvatures; lower drops more points on edges.
+    pub edge_threshold: f64,
+    /// Scales per octave.
+    pub octave_layers: u32,
+    /// Blur in pixels of the first scale.
+    pub sigma_px: f64,
+    /// Share in [0, 1] of the keypoints that is spread evenly over the image (over the sphere, for panoramas); the
+    /// rest goes to the strongest wherever they are.
+    pub even_share: f64,
+    /// Half angle in degrees of a cone about straight down that gives no keypoints (car, tripod); panoramas only.
+    pub nadir_cone_deg: f64,
+}
+
+impl FeatureParams {
+    /// Changes whenever the same parameters and pixels give other features.
+    ///
+    /// 1: OpenCV SIFT, RootSIFT u8, half-pixel corrected, seam padded, spread over the sphere.
+    pub const VERSION: u32 = 1;
+
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// [`FeatureError::InvalidParameter`] with the value at fault.
+    pub fn validate(&self) -> Result<(), FeatureError> {
+        let positive = |name, value: f64| check(name, value, "positive", value > 0.0 && value.is_finite());
+        check(
+            "max_features",
+            self.max_features as f64,
+            "1 to 1000000",
+            (1..=1_000_000).contains(&self.max_features),
+        )?;
+        check("max_side", self.max_side.into(), "32 to 32768", (32..=32_768).contains(&self.max_side))?;
+        positive("contrast_threshold", self.contrast_threshold)?;
+        positive("edge_threshold", self.edge_threshold)?;
+        check("octave_layers", self.octave_layers.into(), "1 to 10", (1..=10).contains(&self.octave_layers))?;
+        check("sigma_px", self.sigma_px, "0.5 to 10", (0.5..=10.0).contains(&self.sigma_px))?;
+        check("even_share", self.even_share, "in [0, 1]", (0.0..=1.0).contains(&self.even_share))?;
+        check(
+            "nadir_cone_deg",
+            self.nadir_cone_deg,
+            "in [0, 90]",
+            (0.0..=90.0).contains(&self.nadir_cone_deg),
+        )
+    }
+}
+
+impl Default for FeatureParams {
+    fn default() -> Self {
+        Self {
+            max_features: 8192,
+            max_side: 4096,
+            contrast_threshold: 0.04,
+            edge_threshold: 10.0,
+            octave_layers: 3,
+            sigma_px: 1.6,
+            even_share: 0.6,
+            nadir_cone_deg: 0.0,
+        }
+    }
+}
+
+/// Columns repeated beyond the seam, as a share of the width: keypoints up to about 1/40 of the width across are
+/// described from the same pixels as anywhere else.
+const SEAM_SHARE: usize = 24;
+/// Cells along the longer side of the grid that spreads keypoints.
+const CELLS: usize = 16;
+/// OpenCV enlarges the image twice by linear interpolation, which puts pixel x at 2x + ½, but halves coordinates as
+/// if it were at 2x: positions come out ¼ pixel too large. With the ½ between the conventions that leaves +¼.
+const CENTER_OFFSET: f32 = 0.5 - 0.25;
+
+static SINGLE_THREADED: Once = Once::new();
+
+/// Detects SIFT keypoints and describes them as RootSIFT.
+///
+/// R. Arandjelović, A. Zisserman, "Three things everyone should know to improve object retrieval", CVPR 2012: the
+/// square root of the L1-normalized descriptor, here times [`DESCRIPTOR_NORM`], rounded and clipped at 255, so all
+/// stored descriptors have about one length and squared distances are exact integers.
+///
+/// A panorama that closes on itself is extended over its seam for detection and only keypoints inside are kept:
+/// nothing is lost or doubled there. Keypoints are chosen for strength and spread (see
+/// [`FeatureParams::even_share`]) and come strongest first. A point with two orientations is two keypoints. `mask`
+/// pixels of 0 give no keypoints. An image without texture gives empty features.
+///
+/// OpenCV is told once per process to use a single thread; callers work on several images in parallel.
+///
+/// # Errors
+/// [`FeatureError::InvalidParameter`], [`FeatureError::InvalidCamera`], [`FeatureError::SizeMismatch`] if the camera
+/// is of another image size, [`FeatureError::Detector`] if OpenCV fails.
+pub fn extract(
+    params: &FeatureParams,
+    image: &DecodedImage,
+    camera: &Camera,
+    mask: Option<&Mask>,
+) -> Result<ImageFeatures, FeatureError> {
+    params.validate()?;
+    camera.validate()?;
+    let (width, height) = (image.width, image.height);
+    if (camera.width, camera.height) != (width, height) {
+        return Err(FeatureError::SizeMismatch {
+            what: "camera",
+            expected_width: width,
+            expected_height: height,
+            width: camera.width,
+            height: camera.height,
+        });
+    }
+    let grey = Grey::new(image).reduced(params.max_side)?;
+    let scale_x = width as f32 / grey.width as f32;
+    let scale_y = height as f32 / grey.height as f32;
+    let padding = if camera.wraps_around() { grey.width / SEAM_SHARE } else { 0 };
+    let (keypoints, descriptors) = detect(params, &grey.wrapped(padding))?;
+
+    let mut candidates: Vec<Candidate> = Vec::with_capacity(keypoints.len());
+    for (row, keypoint) in keypoints.iter().enumerate() {
+        let x = (keypoint.pt().x + CENTER_OFFSET - padding as f32) * scale_x;
+        let y = (keypoint.pt().y + CENTER_OFFSET) * scale_y;
+        let inside = (0.0..width as f32).contains(&x) && (0.0..height as f32).contains(&y);
+        if !inside || mask.is_some_and(|mask| !mask.allows(x, y, width, height)) {
+            continue;
+        }
+        candidates.push(Candidate { row, x, y, response: keypoint.response() });
+    }
+    if params.nadir_cone_deg > 0.0 && camera.is_panoramic() {
+        let limit = params.nadir_cone_deg.to_radians().cos();
+        candidates.retain(|candidate| {
+            camera
+                .unproject(&nalgebra::Vector2::new(candidate.x.into(), candidate.y.into()))
+                .is_none_or(|ray| ray.y < limit)
+        });
+    }
+    // A total order, so that the choice does not depend on the detector's.
+    candidates.sort_by(|a, b| {
+        b.response
+            .total_cmp(&a.response)
+            .then(a.y.total_cmp(&b.y))
+            .then(a.x.total_cmp(&b.x))
+            .then(a.row.cmp(&b.row))
+    });
+    let chosen = choose(params, camera, &candidates);
+
+    let mut features = ImageFeatures {
+        width,
+        height,
+        keypoints: Vec::with_capacity(chosen.len()),
+        descriptors: Vec::with_capacity(chosen.len() * DESCRIPTOR_LEN),
+        colors: Vec::with_capacity(chosen.len()),
+    };
+    for candidate in chosen {
+        let keypoint = keypoints.get(candidate.row).map_err(|error| detector_error(&error))?;
+        let descriptor =
+            descriptors.at_row::<f32>(candidate.row as i32).map_err(|error| detector_error(&error))?;
+        let at = (candidate.y as usize * width as usize + candidate.x as usize) * 3;
+        features.colors.push([image.rgb[at], image.rgb[at + 1], image.rgb[at + 2]]);
+        features.keypoints.push(Keypoint {
+            x: candidate.x,
+            y: candidate.y,
+            size: keypoint.size() * scale_x,
+            orientation: keypoint.angle().to_radians(),
+            noise_px: keypoint_noise_px(keypoint.size()) * scale_x,
+        });
+        push_root_sift(descriptor, &mut features.descriptors);
+    }
+    Ok(features)
+}
+
+/// Expected standard deviation in pixels of the position of a keypoint with this diameter.
+///
+/// Grows linearly with the scale, since a larger region is located on a coarser grid, up to a diameter of 30 pixels.
+/// The slope and the offset are twice those of the median epipolar deviation of correct matches on rendered
+/// panoramas of exact pose, so that matches of real sensors and changing views, whose tails are longer, stay inside.
+pub fn keypoint_noise_px(size: f32) -> f32 {
+    0.2 + 0.07 * size.min(30.0)
+}
+
+struct Candidate {
+    row: usize,
+    x: f32,
+    y: f32,
+    response: f32,
+}
+
+/// A grey image for the detector.
+struct Grey {
+    width: usize,
+    height: usize,
+    values: Vec<u8>,
+}
+
+impl Grey {
+    /// Luma of ITU-R BT.601 in 14-bit integers.
+    fn new(image: &DecodedImage) -> Self {
+        let luma = |pixel: &[u8]| {
+            let sum = 4899 * u32::from(pixel[0]) + 9617 * u32::from(pixel[1]) + 1868 * u32::from(pixel[2]);
+            ((sum + (1 << 13)) >> 14) as u8
+        };
+        let values = image.rgb.chunks_exact(3).map(luma).collect();
+        Self { width: image.width as usize, height: image.height as usize, values }
+    }
+
+    /// Reduced by averaging so that no side is longer than `max_side`.
+    fn reduced(self, max_side: u32) -> Result<Self, FeatureError> {
+        let longer = self.width.max(self.height);
+        if longer <= max_side as usize {
+            return Ok(self);
+        }
+        let share = f64::from(max_side) / longer as f64;
+        let side = |side: usize| ((side as f64 * share).round() as usize).max(1);
+        let (width, height) = (side(self.width), side(self.height));
+        let mut values = vec![0; width * height];
+        let mut run = || {
+            let source = Mat::new_rows_cols_with_data(self.height as i32, self.width as i32, &self.values)?;
+            let mut target = Mat::new_rows_cols_with_data_mut(height as i32, width as i32, &mut values)?;
+            let size = Size::new(width as i32, height as i32);
+            opencv::imgproc::resize(&source, &mut target, size, 0.0, 0.0, opencv::imgproc::INTER_AREA)
+        };
+        run().map_err(|error| detector_error(&error))?;
+        Ok(Self { width, height, values })
+    }
+
+    /// With `padding` columns of the other side left and right.
+    fn wrapped(self, padding: usize) -> Self {
+        if padding == 0 {
+            return self;
+        }
+        let mut values = Vec::with_capacity((self.width + 2 * padding) * self.height);
+        for row in self.values.chunks_exact(self.width) {
+            values.extend_from_slice(&row[self.width - padding..]);
+            values.extend_from_slice(row);
+            values.extend_from_slice(&row[..padding]);
+        }
+        Self { width: self.width + 2 * padding, height: self.height, values }
+    }
+}
+
+fn detect(params: &FeatureParams, grey: &Grey) -> Result<(Vector<KeyPoint>, Mat), FeatureError> {
+    let mut result = Ok(());
+    SINGLE_THREADED.call_once(|| result = opencv::core::set_num_threads(1));
+    result.map_err(|error| detector_error(&error))?;
+    let run = || -> opencv::Result<(Vector<KeyPoint>, Mat)> {
+        let image = Mat::new_rows_cols_with_data(grey.height as i32, grey.width as i32, &grey.values)?;
+        let mut sift = SIFT::create(
+            0,
+            params.octave_layers as i32,
+            params.contrast_threshold,
+            params.edge_threshold,
+            params.sigma_px,
+        )?;
+        let (mut keypoints, mut descriptors) = (Vector::new(), Mat::default());
+        sift.detect_and_compute(&image, &no_array(), &mut keypoints, &mut descriptors, false)?;
+        Ok((keypoints, descriptors))
+    };
+    run().map_err(|error| detector_error(&error))
+}
+
+fn detector_error(error: &opencv::Error) -> FeatureError {
+    FeatureError::Detector { reason: error.message.clone() }
+}
+
+/// The strongest of each cell up to an even share, then the strongest of the rest; strongest first.
+fn choose<'a>(params: &FeatureParams, camera: &Camera, candidates: &'a [Candidate]) -> Vec<&'a Candidate> {
+    let budget = params.max_features;
+    if candidates.len() <= budget {
+        return candidates.iter().collect();
+    }
+    let grid = Grid::new(camera);
+    let cells: Vec<usize> = candidates.iter().map(|candidate| grid.cell(camera, candidate)).collect();
+    let mut counts = vec![0usize; grid.columns * grid.rows];
+    for &cell in &cells {
+        counts[cell] += 1;
+    }
+    let quota = cell_quota(&counts, (budget as f64 * params.even_share) as usize);
+    let mut taken = vec![0usize; counts.len()];
+    let mut kept = vec![false; candidates.len()];
+    for (index, &cell) in cells.iter().enumerate() {
+        if taken[cell] < quota {
+            taken[cell] += 1;
+            kept[index] = true;
+        }
+    }
+    let mut left = budget - taken.iter().sum::<usize>();
+    for kept in &mut kept {
+        if left == 0 {
+            break;
+        }
+        if !*kept {
+            *kept = true;
+            left -= 1;
+        }
+    }
+    candidates.iter().zip(kept).filter(|(_, kept)| *kept).map(|(candidate, _)| candidate).collect()
+}
+
+/// The largest number per cell that keeps the sum within the budget: sparse cells leave their share to the others.
+fn cell_quota(counts: &[usize], budget: usize) -> usize {
+    let (mut low, mut high) = (0, budget);
+    while low < high {
+        let middle = (low + high).div_ceil(2);
+        match counts.iter().map(|&count| count.min(middle)).sum::<usize>().cmp(&budget) {
+            Ordering::Greater => high = middle - 1,
+            _ => low = middle,
+        }
+    }
+    low
+}
+
+/// Cells of equal solid angle for panoramas, of equal pixel area for photos.
+struct Grid {
+    columns: usize,
+    rows: usize,
+}
+
+impl Grid {
+    fn new(camera: &Camera) -> Self {
+        let longer = f64::from(camera.width.max(camera.height));
+        let cells = |side: u32| ((CELLS as f64 * f64::from(side) / longer).round() as usize).max(1);
+        Self { columns: cells(camera.width), rows: cells(camera.height) }
+    }
+
+    fn cell(&self, camera: &Camera, candidate: &Candidate) -> usize {
+        let x = f64::from(candidate.x) / f64::from(camera.width);
+        let y = f64::from(candidate.y) / f64::from(camera.height);
+        // Archimedes: equal steps of the sine of latitude are equal areas.
+        let sine = |y: f64| {
+            let pixel = nalgebra::Vector2::new(0.0, y);
+            camera.unproject(&pixel).map_or(0.0, |ray| ray.y)
+        };
+        let y = if camera.is_panoramic() {
+            let (top, bottom) = (sine(0.0), sine(camera.height.into()));
+            (sine(candidate.y.into()) - top) / (bottom - top)
+        } else {
+            y
+        };
+        let place = |share: f64, cells: usize| ((share * cells as f64) as usize).min(cells - 1);
+        place(y, self.rows) * self.columns + place(x, self.columns)
+    }
+}
+
+/// Appends the square root of the L1-normalized descriptor in bytes.
+fn push_root_sift(descriptor: &[f32], target: &mut Vec<u8>) {
+    let sum: f32 = descriptor.iter().sum();
+    let scale = if sum > 0.0 { f32::from(DESCRIPTOR_NORM) / sum.sqrt() } else { 0.0 };
+    // The cast saturates at 255.
+    target.extend(descriptor.iter().map(|value| (value.sqrt() * scale).round() as u8));
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector2;
+
+    use super::*;
+
+    const BLOB: f64 = 4.0;
+
+    /// Bright Gaussian blobs of 4 pixels on grey, x periodic.
+    fn blobs(width: u32, height: u32, centers: &[[f64; 2]]) -> DecodedImage {
+        let mut rgb = Vec::new();
+        for y in 0..height {
+            for x in 0..width {
+                let mut value = 60.0;
+                for center in centers {
+                    let dx = (f64::from(x) + 0.5 - center[0]).abs();
+                    let dx = dx.min(f64::from(width) - dx);
+                    let dy = f64::from(y) + 0.5 - center[1];
+                    value += 150.0 * (-(dx * dx + dy * dy) / (2.0 * BLOB * BLOB)).exp();
+                }
+                rgb.extend([value.min(255.0) as u8; 3]);
+            }
+        }
+        DecodedImage::from_rgb(width, height, rgb).unwrap()
+    }
+
+    /// A reproducible picture with texture of several sizes everywhere.
+    fn texture(width: u32, height: u32) -> DecodedImage {
+        let wave = |x: u32, y: u32, a: u32, b: u32| f64::from(x * a + y * b) * 0.013;
+        let rgb = (0..height)
+            .flat_map(|y| {
+                (0..width).flat_map(move |x| {
+                    let (i, j) = (x / 6, y / 5);
+                    let hash = (i.wrapping_mul(2654435761) ^ j.wrapping_mul(2246822519))
+                        .wrapping_mul(3266489917)
+                        >> 25;
+                    [(f64::from(hash) + 60.0 * (wave(x, y, 3, 1).sin() + 1.0)) as u8; 3]
+                })
+            })
+            .collect();
+        DecodedImage::from_rgb(width, height, rgb).unwrap()
+    }
+
+    fn photo(width: u32, height: u32) -> Camera {
+        Camera::from_focal_guess(width, height, f64::from(width))
+    }
+
+    fn nearest(features: &ImageFeatures, center: [f64; 2]) -> f64 {
+        let target = Vector2::from(center);
+        features
+            .keypoints
+            .iter()
+            .map(|keypoint| (keypoint.pixel() - target).norm())
+            .fold(f64::INFINITY, f64::min)
+    }
+
+    #[test]
+    fn keypoints_lie_where_the_blobs_are() {
+        let centers = [[60.5, 70.5], [130.3, 60.8], [90.75, 140.25], [170.0, 150.0]];
+        let features =
+            extract(&FeatureParams::default(), &blobs(240, 200, &centers), &photo(240, 200), None).unwrap();
+        for center in centers {
+            assert!(nearest(&features, center) < 0.05, "{center:?}: {}", nearest(&features, center));
+        }
+    }
+
+    #[test]
+    fn reduced_images_give_keypoints_in_full_pixels() {
+        let centers = [[60.5, 70.5], [130.3, 60.8], [90.75, 140.25]];
+        let params = FeatureParams { max_side: 160, ..FeatureParams::default() };
+        let features = extract(&params, &blobs(240, 200, &centers), &photo(240, 200), None).unwrap();
+        for center in centers {
+            assert!(nearest(&features, center) < 0.1, "{center:?}: {}", nearest(&features, center));
+        }
+    }
+
+    #[test]
+    fn the_seam_neither_loses_nor_doubles_a_blob() {
+        for x in [0.3, 3.0, 399.9, 200.0] {
+            let image = blobs(400, 200, &[[x, 100.0]]);
+            let camera = Camera::equirectangular(400, 200);
+            let features = extract(&FeatureParams::default(), &image, &camera, None).unwrap();
+            let mut places: Vec<_> =
+                features.keypoints.iter().map(|k| (k.x.to_bits(), k.y.to_bits())).collect();
+            places.dedup();
+            assert_eq!(places.len(), 1, "{x}: {:?}", features.keypoints);
+            let keypoint = features.keypoints[0];
+            let dx = (f64::from(keypoint.x) - x + 200.0).rem_euclid(400.0) - 200.0;
+            assert!(dx.hypot(f64::from(keypoint.y) - 100.0) < 0.05, "{x}: {keypoint:?}");
+        }
+    }
+
+    #[test]
+    fn descriptors_across_the_seam_equal_those_elsewhere() {
+        let camera = Camera::equirectangular(960, 480);
+        let middle = texture(960, 480);
+        let mut turned = middle.clone();
+        for (target, source) in turned.rgb.chunks_exact_mut(960 * 3).zip(middle.rgb.chunks_exact(960 * 3)) {
+            target.copy_from_slice(source);
+            target.rotate_left(480 * 3);
+        }
+        let params = FeatureParams::default();
+        let first = extract(&params, &middle, &camera, None).unwrap();
+        let second = extract(&params, &turned, &camera, None).unwrap();
+        let near_middle = |keypoint: &Keypoint| (keypoint.x - 480.0).abs() < 10.0 && keypoint.size < 4.0;
+        let mut compared = 0;
+        for (index, keypoint) in
+            first.keypoints.iter().enumerate().filter(|(_, keypoint)| near_middle(keypoint))
+        {
+            let x = (keypoint.x + 480.0) % 960.0;
+            let twin = (0..second.len()).find(|&other| {
+                let candidate = second.keypoints[other];
+                (candidate.x - x).abs() < 0.02
+                    && (candidate.y - keypoint.y).abs() < 0.02
+                    && (candidate.orientation - keypoint.orientation).abs() < 0.01
+            });
+            let twin = twin.unwrap_or_else(|| panic!("{keypoint:?} has no twin across the seam"));
+            let difference = first
+                .descriptor(index)
+                .iter()
+                .zip(second.descriptor(twin))
+                .map(|(&a, &b)| a.abs_diff(b))
+                .max();
+            assert!(difference <= Some(3), "{difference:?}");
+            compared += 1;
+        }
+        assert!(compared > 10, "{compared}");
+    }
+
+    #[test]
+    fn stored_descriptors_have_about_one_length() {
+        let features =
+            extract(&FeatureParams::default(), &texture(300, 200), &photo(300, 200), None).unwrap();
+        assert!(features.len() > 100);
+        assert_eq!(features.descriptors.len(), features.len() * DESCRIPTOR_LEN);
+        for index in 0..features.len() {
+            let norm2: f64 = features.descriptor(index).iter().map(|&value| f64::from(value).powi(2)).sum();
+            assert!((norm2.sqrt() - 512.0).abs() < 8.0, "{}", norm2.sqrt());
+        }
+    }
+
+    #[test]
+    fn a_small_budget_is_kept_and_spread() {
+        let image = texture(600, 300);
+        let camera = Camera::equirectangular(600, 300);
+        let params = FeatureParams { max_features: 256, even_share: 1.0, ..FeatureParams::default() };
+        let features = extract(&params, &image, &camera, None).unwrap();
+        assert!(features.len() <= 256 && features.len() > 200, "{}", features.len());
+        let near_pole = |keypoint: &&Keypoint| (keypoint.y - 150.0).abs() > 100.0;
+        // Beyond 60° of latitude lie 13 % of the sphere, but a third of the rows.
+        let share = features.keypoints.iter().filter(near_pole).count() as f64 / features.len() as f64;
+        assert!((0.05..0.22).contains(&share), "{share}");
+    }
+
+    #[test]
+    fn masks_and_the_nadir_cone_keep_keypoints_out() {
+        let image = texture(600, 300);
+        let camera = Camera::equirectangular(600, 300);
+        let mut values = vec![255; 60 * 30];
+        values.iter_mut().enumerate().filter(|(index, _)| index % 60 < 30).for_each(|(_, value)| *value = 0);
+        let mask = Mask::new(60, 30, values).unwrap();
+        let params = FeatureParams { nadir_cone_deg: 45.0, ..FeatureParams::default() };
+        let features = extract(&params, &image, &camera, Some(&mask)).unwrap();
+        assert!(features.len() > 100);
+        assert!(features.keypoints.iter().all(|keypoint| keypoint.x >= 300.0 && keypoint.y <= 225.1));
+    }
+
+    #[test]
+    fn images_without_texture_or_hardly_any_pixels_are_empty() {
+        for (width, height) in [(64, 64), (1, 1), (3, 200)] {
+            let image =
+                DecodedImage::from_rgb(width, height, vec![0; (width * height * 3) as usize]).unwrap();
+            let features = extract(&FeatureParams::default(), &image, &photo(width, height), None).unwrap();
+            assert!(features.is_empty());
+            assert_eq!((features.width, features.height), (width, height));
+        }
+    }
+
+    #[test]
+    fn wrong_sizes_and_parameters_are_named() {
+        let image = texture(60, 40);
+        let error = extract(&FeatureParams::default(), &image, &photo(40, 60), None).unwrap_err();
+        assert_eq!(error.to_string(), "camera: expected 60 × 40, got 40 × 60");
+        let params = FeatureParams { even_share: f64::NAN, ..FeatureParams::default() };
+        assert!(extract(&params, &image, &photo(60, 40), None).is_err());
+    }
+
+    #[test]
+    fn sparse_cells_leave_their_share_to_others() {
+        assert_eq!(cell_quota(&[0, 1, 100, 100], 61), 30);
+        assert_eq!(cell_quota(&[5, 5], 100), 100);
+        assert_eq!(cell_quota(&[5, 5], 0), 0);
+    }
+}
