@@ -5,6 +5,7 @@
 //! the same bytes.
 
 mod absolute_pose;
+mod absolute_pose_focal;
 mod generalized_pose;
 mod least_squares;
 mod ransac;
@@ -12,6 +13,7 @@ mod relative_pose;
 mod residual;
 
 pub use absolute_pose::{AbsolutePoseEstimate, estimate_absolute_pose, refine_absolute_pose};
+pub use absolute_pose_focal::{AbsolutePoseFocalEstimate, estimate_absolute_pose_focal};
 pub use generalized_pose::{
     GeneralizedPoseEstimate, GeneralizedPoseOptions, GeneralizedSolver, Gravity, SetScale, estimate_generalized_pose,
     refine_generalized_pose,
