@@ -10,13 +10,13 @@ use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use nalgebra::Vector3;
 use rand_chacha::ChaCha8Rng;
 use setloc_sfm::robust::{
-    GeneralizedPoseOptions, GeneralizedSolver, RansacParams, estimate_absolute_pose, estimate_generalized_pose,
-    estimate_relative_pose,
+    GeneralizedPoseOptions, GeneralizedSolver, RansacParams, estimate_absolute_pose,
+    estimate_generalized_pose, estimate_relative_pose,
 };
 use setloc_sfm::solvers::essential::essential_from_pose;
 use setloc_sfm::solvers::{dlt, five_point, gp3p, gp4ps, p3p, ugp3ps};
 use setloc_sfm::synthetic::{
-    AbsoluteProblem, GeneralizedProblem, RelativeProblem, rotation_angle, same_similarity, seeded,
+    AbsoluteProblem, GeneralizedProblem, RaySample, RelativeProblem, rotation_angle, same_similarity, seeded,
 };
 use setloc_sfm::{Rigid, Similarity};
 
@@ -27,14 +27,19 @@ const TOLERANCE: f64 = 1e-5;
 /// 0.5 px at a focal length of 800 px.
 const SIGMA: f64 = 0.5 / 800.0;
 
-type Rays<const N: usize> = ([Vector3<f64>; N], [Vector3<f64>; N], [Vector3<f64>; N]);
-
-fn generalized<const N: usize>(rng: &mut ChaCha8Rng, cameras: [u32; N], upright: bool) -> (Rays<N>, Similarity) {
+fn generalized<const N: usize>(
+    rng: &mut ChaCha8Rng,
+    cameras: [u32; N],
+    upright: bool,
+) -> (RaySample<N>, Similarity) {
     let problem = GeneralizedProblem::exact(rng, &cameras, upright);
     (problem.sample(), problem.world_from_set)
 }
 
-fn central(rng: &mut ChaCha8Rng) -> (([Vector3<f64>; 3], [Vector3<f64>; 3]), Rigid) {
+/// Bearings and points.
+type Central = ([Vector3<f64>; 3], [Vector3<f64>; 3]);
+
+fn central(rng: &mut ChaCha8Rng) -> (Central, Rigid) {
     let problem = AbsoluteProblem::exact(rng, 3);
     let of = |list: &[Vector3<f64>]| std::array::from_fn(|i| list[i]);
     ((of(&problem.bearings), of(&problem.points)), problem.world_from_camera)
@@ -139,7 +144,8 @@ fn median(mut values: Vec<f64>) -> f64 {
 fn generalized_accuracy(name: &str, options: &GeneralizedPoseOptions, outliers: f64, problems: u64) {
     let mut rng = seeded(name);
     let cameras: Vec<u32> = (0..200).map(|i| i % 4).collect();
-    let (mut rotations, mut positions, mut scales, mut times) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut rotations, mut positions, mut scales, mut times) =
+        (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for seed in 0..problems {
         let mut problem = GeneralizedProblem::exact(&mut rng, &cameras, false);
         problem.disturb(&mut rng, SIGMA, outliers);

@@ -15,8 +15,8 @@ mod residual;
 pub use absolute_pose::{AbsolutePoseEstimate, estimate_absolute_pose, refine_absolute_pose};
 pub use absolute_pose_focal::{AbsolutePoseFocalEstimate, estimate_absolute_pose_focal};
 pub use generalized_pose::{
-    GeneralizedPoseEstimate, GeneralizedPoseOptions, GeneralizedSolver, Gravity, SetScale, estimate_generalized_pose,
-    refine_generalized_pose,
+    GeneralizedPoseEstimate, GeneralizedPoseOptions, GeneralizedSolver, Gravity, SetScale,
+    estimate_generalized_pose, refine_generalized_pose,
 };
 pub use ransac::{InvalidParams, RansacParams};
 pub use relative_pose::{

@@ -9,6 +9,9 @@ use rand_chacha::ChaCha8Rng;
 use crate::robust::GeneralizedRay;
 use crate::{Rigid, Similarity};
 
+/// Origins, directions and points of `N` rays.
+pub type RaySample<const N: usize> = ([Vector3<f64>; N], [Vector3<f64>; N], [Vector3<f64>; N]);
+
 /// A generator whose seed is derived from a name, so that tests do not share their draws (FNV-1a).
 pub fn seeded(name: &str) -> ChaCha8Rng {
     let hash = name.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
@@ -131,7 +134,8 @@ impl AbsoluteProblem {
         let wrong = (outlier_fraction * self.bearings.len() as f64).round() as usize;
         for i in 0..self.bearings.len() {
             self.outlier[i] = i < wrong;
-            self.bearings[i] = if i < wrong { random_unit(rng) } else { perturb(rng, &self.bearings[i], sigma) };
+            self.bearings[i] =
+                if i < wrong { random_unit(rng) } else { perturb(rng, &self.bearings[i], sigma) };
         }
     }
 }
@@ -156,7 +160,9 @@ impl GeneralizedProblem {
     /// 0.2 to 5, the rotation uniformly, or about +z only when `upright`.
     pub fn exact(rng: &mut impl Rng, camera_of_ray: &[u32], upright: bool) -> Self {
         let rotation = if upright {
-            UnitQuaternion::from_scaled_axis(Vector3::z() * rng.random_range(-3.14..3.14))
+            UnitQuaternion::from_scaled_axis(
+                Vector3::z() * rng.random_range(-1.0..1.0) * std::f64::consts::PI,
+            )
         } else {
             random_rotation(rng)
         };
@@ -196,7 +202,7 @@ impl GeneralizedProblem {
     ///
     /// # Panics
     /// When there are fewer.
-    pub fn sample<const N: usize>(&self) -> ([Vector3<f64>; N], [Vector3<f64>; N], [Vector3<f64>; N]) {
+    pub fn sample<const N: usize>(&self) -> RaySample<N> {
         (
             std::array::from_fn(|i| self.rays[i].origin),
             std::array::from_fn(|i| self.rays[i].direction),

@@ -189,7 +189,8 @@ mod tests {
             )
             .unwrap();
             assert!((found.focal / problem.focal).ln().abs() < 0.02, "{} {}", found.focal, problem.focal);
-            let angle = rotation_angle(&found.world_from_camera.rotation, &problem.world_from_camera.rotation);
+            let angle =
+                rotation_angle(&found.world_from_camera.rotation, &problem.world_from_camera.rotation);
             assert!(angle.to_degrees() < 0.3);
             assert!(found.inliers.len() > 55);
         }
@@ -200,7 +201,8 @@ mod tests {
         let problem = FocalProblem::exact(&mut seeded("range"), 50);
         let range = (2.0 * problem.focal, 3.0 * problem.focal);
         let params = RansacParams { max_iterations: 200, ..RansacParams::default() };
-        let found = estimate_absolute_pose_focal(&params, &problem.pixels, &[0.5; 50], &problem.points, range, 1);
+        let found =
+            estimate_absolute_pose_focal(&params, &problem.pixels, &[0.5; 50], &problem.points, range, 1);
         assert!(found.is_none());
     }
 }

@@ -167,10 +167,10 @@ impl<'a> GeneralizedConsensus<'a> {
         if rays.len() != points.len() || rays.is_empty() {
             return None;
         }
-        if let SetScale::Known(scale) = options.scale {
-            if !(scale > 0.0) || !scale.is_finite() {
-                return None;
-            }
+        if let SetScale::Known(scale) = options.scale
+            && (!(scale > 0.0) || !scale.is_finite())
+        {
+            return None;
         }
         let upright = match options.gravity {
             Some(gravity) if options.scale == SetScale::Unknown => {
@@ -194,7 +194,8 @@ impl<'a> GeneralizedConsensus<'a> {
     /// The origin that the given rays share, if they do.
     fn common_origin(&self, indices: &[u32]) -> Option<Vector3<f64>> {
         let first = self.rays[*indices.first()? as usize].origin;
-        let shares = |i: &u32| (self.rays[*i as usize].origin - first).norm_squared() <= self.same_centre_squared;
+        let shares =
+            |i: &u32| (self.rays[*i as usize].origin - first).norm_squared() <= self.same_centre_squared;
         indices.iter().all(shares).then_some(first)
     }
 
@@ -203,7 +204,7 @@ impl<'a> GeneralizedConsensus<'a> {
         let count = self.rays.len();
         self.draws += 1;
         let mut sample = distinct::<N>(rng, count);
-        if self.draws % FREE_SAMPLES != 0 {
+        if !self.draws.is_multiple_of(FREE_SAMPLES) {
             for k in 1..N {
                 for _ in 0..4 {
                     if sample[..k].iter().all(|i| self.rays[*i].camera != self.rays[sample[k]].camera) {
@@ -238,9 +239,10 @@ impl<'a> GeneralizedConsensus<'a> {
 fn upright(up: &Vector3<f64>) -> Option<UnitQuaternion<f64>> {
     let up = up.try_normalize(0.0)?;
     // The half turn about x when `up` is −z, where the shortest rotation is undefined.
-    Some(UnitQuaternion::rotation_between(&up, &Vector3::z()).unwrap_or_else(|| {
-        UnitQuaternion::from_scaled_axis(Vector3::x() * std::f64::consts::PI)
-    }))
+    Some(
+        UnitQuaternion::rotation_between(&up, &Vector3::z())
+            .unwrap_or_else(|| UnitQuaternion::from_scaled_axis(Vector3::x() * std::f64::consts::PI)),
+    )
 }
 
 impl Consensus for GeneralizedConsensus<'_> {
@@ -272,9 +274,14 @@ impl Consensus for GeneralizedConsensus<'_> {
                 return;
             }
             let origins = sample.map(|i| self.rays[i].origin * scale);
-            let poses = gp3p(&origins, &sample.map(|i| self.rays[i].direction), &sample.map(|i| self.points[i]));
+            let poses =
+                gp3p(&origins, &sample.map(|i| self.rays[i].direction), &sample.map(|i| self.points[i]));
             models.extend(poses.iter().map(|pose| {
-                SetFromWorld::new(&Similarity { scale, rotation: pose.rotation, translation: pose.translation })
+                SetFromWorld::new(&Similarity {
+                    scale,
+                    rotation: pose.rotation,
+                    translation: pose.translation,
+                })
             }));
         } else if self.options.solver == GeneralizedSolver::Dlt {
             let sample = self.draw::<6>(rng);
@@ -345,7 +352,8 @@ impl LeastSquares<7> for GeneralizedFit<'_> {
             let ray = &self.data.rays[i];
             let rotated = model.rotation * self.data.points[i];
             let shift = ray.origin * model.scale;
-            let residual = AngularResidual::new(&ray.direction, &(rotated + model.translation - shift), ray.sigma);
+            let residual =
+                AngularResidual::new(&ray.direction, &(rotated + model.translation - shift), ray.sigma);
             let (loss, weight) = cauchy(residual.value.norm_squared(), self.data.inverse_scale_squared);
             cost += loss;
             for (value, row) in [(residual.value.x, residual.rows.0), (residual.value.y, residual.rows.1)] {
@@ -390,7 +398,10 @@ mod tests {
         problem
     }
 
-    fn estimate(problem: &GeneralizedProblem, options: &GeneralizedPoseOptions) -> Option<GeneralizedPoseEstimate> {
+    fn estimate(
+        problem: &GeneralizedProblem,
+        options: &GeneralizedPoseOptions,
+    ) -> Option<GeneralizedPoseEstimate> {
         let params = RansacParams { min_inliers: 10, ..RansacParams::default() };
         estimate_generalized_pose(&params, &problem.rays, &problem.points, options, 5)
     }
@@ -445,7 +456,10 @@ mod tests {
         assert!(!found.scale_observable && found.world_from_set.scale == 1.0);
         let centre = problem.rays[0].origin;
         let truth = problem.world_from_set.transform_point(&centre);
-        assert!((found.world_from_set.transform_point(&centre) - truth).norm() < 0.05 * problem.world_from_set.scale);
+        assert!(
+            (found.world_from_set.transform_point(&centre) - truth).norm()
+                < 0.05 * problem.world_from_set.scale
+        );
         assert!(rotation_angle(&found.world_from_set.rotation, &problem.world_from_set.rotation) < 2e-3);
     }
 
@@ -467,7 +481,9 @@ mod tests {
         let params = RansacParams { max_iterations: 500, min_inliers: 12, ..RansacParams::default() };
         let options = GeneralizedPoseOptions::default();
         assert!(estimate_generalized_pose(&params, &problem.rays, &problem.points, &options, 1).is_none());
-        assert!(estimate_generalized_pose(&params, &problem.rays, &problem.points[1..], &options, 1).is_none());
+        assert!(
+            estimate_generalized_pose(&params, &problem.rays, &problem.points[1..], &options, 1).is_none()
+        );
         let options = GeneralizedPoseOptions { scale: SetScale::Known(-1.0), ..options };
         assert!(estimate_generalized_pose(&params, &problem.rays, &problem.points, &options, 1).is_none());
     }

@@ -114,7 +114,11 @@ mod tests {
                 let cameras: Vec<_> = (0..count).map(|i| i % 4).collect();
                 let problem = GeneralizedProblem::exact(&mut rng, &cameras, false);
                 let found = solve(&problem).unwrap();
-                assert!(same_similarity(&found, &problem.world_from_set, if count == 20 { 1e-9 } else { 1e-5 }));
+                assert!(same_similarity(
+                    &found,
+                    &problem.world_from_set,
+                    if count == 20 { 1e-9 } else { 1e-5 }
+                ));
             }
         }
     }

@@ -44,12 +44,7 @@ pub fn five_point(first: &[Vector3<f64>; 5], second: &[Vector3<f64>; 5]) -> Solu
     for (row, target) in b.iter_mut().enumerate() {
         let (e, f) = (&reduced[2 * row], &reduced[2 * row + 1]);
         for (column, out) in [(0, &mut target.0), (3, &mut target.1)] {
-            *out = [
-                e[column + 2],
-                e[column + 1] - f[column + 2],
-                e[column] - f[column + 1],
-                -f[column],
-            ];
+            *out = [e[column + 2], e[column + 1] - f[column + 2], e[column] - f[column + 1], -f[column]];
         }
         target.2 = [e[9], e[8] - f[9], e[7] - f[8], e[6] - f[7], -f[6]];
     }

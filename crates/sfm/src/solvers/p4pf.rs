@@ -59,10 +59,12 @@ pub fn p4pf(pixels: &[Vector2<f64>; 4], points_in_world: &[Vector3<f64>; 4]) -> 
         let residual = evaluate_quadric(&norms, weights).0.abs() / (size * size);
         let camera = (basis[0] * weights.x + basis[1] * weights.y + basis[2] * weights.z + basis[3]) / size;
         let left = Matrix3::new(
-            camera[0], camera[1], camera[2], camera[4], camera[5], camera[6], camera[8], camera[9], camera[10],
+            camera[0], camera[1], camera[2], camera[4], camera[5], camera[6], camera[8], camera[9],
+            camera[10],
         );
         let sign = left.determinant().signum();
-        let (n0, n1, n2) = (left.row(0).norm_squared(), left.row(1).norm_squared(), left.row(2).norm_squared());
+        let (n0, n1, n2) =
+            (left.row(0).norm_squared(), left.row(1).norm_squared(), left.row(2).norm_squared());
         let focal = (0.5 * (n0 + n1) / n2).sqrt();
         let scale = sign / n2.sqrt();
         if !focal.is_finite() || !(focal > 0.0) || !scale.is_finite() {
@@ -167,7 +169,9 @@ mod tests {
         let pixels = std::array::from_fn(|i| problem.pixels[i]);
         let points = std::array::from_fn(|i| problem.points[i]);
         for found in &p4pf(&pixels, &points) {
-            assert!(found.focal.is_finite() && found.world_from_camera.translation.iter().all(|v| v.is_finite()));
+            assert!(
+                found.focal.is_finite() && found.world_from_camera.translation.iter().all(|v| v.is_finite())
+            );
         }
     }
 }

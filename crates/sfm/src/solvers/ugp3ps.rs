@@ -36,8 +36,7 @@ pub fn ugp3ps(
         let x = (points_in_world[i] - points_in_world[0]) / unit;
         let p = (origins_in_set[i] - origins_in_set[0]) / reach;
         for (row, n) in [(2 * i - 2, u), (2 * i - 1, v)] {
-            rows[row] =
-                [n.dot(&first), -n.dot(&p), n.x * x.x + n.y * x.y, n.x * x.y - n.y * x.x, n.z * x.z];
+            rows[row] = [n.dot(&first), -n.dot(&p), n.x * x.x + n.y * x.y, n.x * x.y - n.y * x.x, n.z * x.z];
         }
     }
     if !eliminate_columns(&mut rows, 2) {
@@ -87,7 +86,9 @@ pub fn ugp3ps(
             && (1..3).all(|i| {
                 let x = (points_in_world[i] - points_in_world[0]) / unit;
                 let turned = Vector3::new(cos * x.x + sin * x.y, cos * x.y - sin * x.x, x.z) + first * depth;
-                directions_in_set[i].dot(&(turned - (origins_in_set[i] - origins_in_set[0]) * (scale / reach))) > 0.0
+                directions_in_set[i]
+                    .dot(&(turned - (origins_in_set[i] - origins_in_set[0]) * (scale / reach)))
+                    > 0.0
             });
         if valid {
             let scale = scale * unit / reach;
@@ -125,7 +126,8 @@ mod tests {
 
     #[test]
     fn one_centre_leaves_the_scale_free() {
-        let (origins, directions, points) = GeneralizedProblem::exact(&mut seeded("u3"), &[0; 3], true).sample();
+        let (origins, directions, points) =
+            GeneralizedProblem::exact(&mut seeded("u3"), &[0; 3], true).sample();
         assert!(ugp3ps(&origins, &directions, &points).is_empty());
     }
 }
