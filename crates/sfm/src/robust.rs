@@ -9,6 +9,7 @@ mod absolute_pose_focal;
 mod generalized_pose;
 mod least_squares;
 mod ransac;
+mod ray_homography;
 mod relative_pose;
 mod residual;
 
@@ -19,6 +20,7 @@ pub use generalized_pose::{
     estimate_generalized_pose, refine_generalized_pose,
 };
 pub use ransac::{InvalidParams, RansacParams};
+pub use ray_homography::{RayHomographyEstimate, estimate_ray_homography};
 pub use relative_pose::{
     RelativePoseEstimate, RotationEstimate, estimate_relative_pose, estimate_rotation, refine_relative_pose,
 };

@@ -1,6 +1,7 @@
-use nalgebra::{Matrix3, SVector, Vector2, Vector3};
+use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::Solutions;
+use super::null_space::null_space;
 use super::quadrics::{Quadric, evaluate_quadric, intersect_quadrics};
 use crate::Rigid;
 
@@ -47,7 +48,7 @@ pub fn p4pf(pixels: &[Vector2<f64>; 4], points_in_world: &[Vector3<f64>; 4]) -> 
             columns[2 * i + 1][8 + k] = -pixel.y * homogeneous[k];
         }
     }
-    let basis = null_space(columns);
+    let basis: [_; 4] = null_space(columns);
     let row = |n: usize, r: usize| Vector3::new(basis[n][4 * r], basis[n][4 * r + 1], basis[n][4 * r + 2]);
     let orthogonal = |r: usize, s: usize| quadric(|m, n| row(m, r).dot(&row(n, s)));
     let norms = quadric(|m, n| row(m, 0).dot(&row(n, 0)) - row(m, 1).dot(&row(n, 1)));
@@ -107,35 +108,6 @@ fn quadric(form: impl Fn(usize, usize) -> f64) -> Quadric {
         cross(2, 3),
         form(3, 3),
     ]
-}
-
-/// Orthonormal basis of the vectors orthogonal to eight others, by Householder reflections.
-fn null_space(mut columns: [[f64; 12]; 8]) -> [SVector<f64, 12>; 4] {
-    let mut beta = [0.0; 8];
-    for k in 0..8 {
-        let norm = columns[k][k..].iter().map(|v| v * v).sum::<f64>().sqrt();
-        columns[k][k] += norm.copysign(columns[k][k]);
-        let square = columns[k][k..].iter().map(|v| v * v).sum::<f64>();
-        beta[k] = if square > 0.0 { 2.0 / square } else { 0.0 };
-        let reflector = columns[k];
-        for other in &mut columns[k + 1..] {
-            let dot = (k..12).map(|i| reflector[i] * other[i]).sum::<f64>() * beta[k];
-            for i in k..12 {
-                other[i] -= dot * reflector[i];
-            }
-        }
-    }
-    std::array::from_fn(|n| {
-        let mut vector = SVector::<f64, 12>::zeros();
-        vector[8 + n] = 1.0;
-        for k in (0..8).rev() {
-            let dot = (k..12).map(|i| columns[k][i] * vector[i]).sum::<f64>() * beta[k];
-            for i in k..12 {
-                vector[i] -= dot * columns[k][i];
-            }
-        }
-        vector
-    })
 }
 
 #[cfg(test)]
