@@ -14,9 +14,10 @@ use setloc_sfm::robust::{
     estimate_generalized_pose, estimate_relative_pose,
 };
 use setloc_sfm::solvers::essential::essential_from_pose;
-use setloc_sfm::solvers::{dlt, five_point, gp3p, gp4ps, p3p, ugp3ps};
+use setloc_sfm::solvers::{PoseWithFocal, dlt, five_point, gp3p, gp4ps, p3p, p4pf, ugp3ps};
 use setloc_sfm::synthetic::{
-    AbsoluteProblem, GeneralizedProblem, RaySample, RelativeProblem, rotation_angle, same_similarity, seeded,
+    AbsoluteProblem, FocalProblem, GeneralizedProblem, RaySample, RelativeProblem, rotation_angle,
+    same_similarity, seeded,
 };
 use setloc_sfm::{Rigid, Similarity};
 
@@ -127,6 +128,22 @@ fn minimal(criterion: &mut Criterion) {
     solver(criterion, "ugp3ps", upright, |(origins, directions, points), truth| {
         let found = ugp3ps(origins, directions, points);
         (found.len(), similarity_found(&found, truth))
+    });
+    let pinhole = |rng: &mut ChaCha8Rng| {
+        let problem = FocalProblem::exact(rng, 4);
+        let input: ([_; 4], [_; 4]) =
+            (std::array::from_fn(|i| problem.pixels[i]), std::array::from_fn(|i| problem.points[i]));
+        (input, (problem.world_from_camera, problem.focal))
+    };
+    solver(criterion, "p4pf", pinhole, |(pixels, points), truth| {
+        let found = p4pf(pixels, points);
+        let near = |solution: &PoseWithFocal| {
+            truth.is_none_or(|(pose, focal)| {
+                (solution.focal / focal).ln().abs() < TOLERANCE
+                    && rigid_found(&[solution.world_from_camera], Some(pose))
+            })
+        };
+        (found.len(), truth.is_none() || found.iter().any(near))
     });
     let eight = |rng: &mut ChaCha8Rng| generalized(rng, [0, 1, 2, 3, 0, 1, 2, 3], false);
     solver(criterion, "dlt of 8", eight, |(origins, directions, points), truth| {

@@ -15,7 +15,5 @@ mod two_view;
 
 pub use geometry::{Rigid, Similarity};
 pub use mapper::{InputImage, MapperInput, MapperOutput, MapperParams, MapperReport, reconstruct};
-pub use reconstruction::{
-    CameraId, ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint,
-};
+pub use reconstruction::{CameraId, ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint};
 pub use two_view::{PairGeometry, TwoView, TwoViewKind, TwoViewParams, verify_pair};

@@ -53,12 +53,6 @@ pub struct PairGeometry {
 }
 
 /// Verifies putative matches on the sphere; `None` when no geometry is supported.
-pub fn verify_pair(
-    _params: &TwoViewParams,
-    _first: &Rays,
-    _second: &Rays,
-    _matches: &[Match],
-    _seed: u64,
-) -> Option<TwoView> {
+pub fn verify_pair(_params: &TwoViewParams, _first: &Rays, _second: &Rays, _matches: &[Match], _seed: u64) -> Option<TwoView> {
     None
 }
