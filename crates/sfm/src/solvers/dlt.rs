@@ -9,8 +9,8 @@ use crate::{Rigid, Similarity};
 /// are solved by least squares; the RQ decomposition of T's left block gives K and R, and T is projected to
 /// s·\[R | t\] with s = trace(K)/3.
 ///
-/// The linear solver of the image-set localization paper this project follows ("Image Set Localization", DLT with the
-/// Kronecker product and projection by RQ, after R. Hartley, A. Zisserman, "Multiple View Geometry", section 6.2). One
+/// The linear solver of "Image Set Querying Based Localization", which this project follows; RQ as in R. Hartley,
+/// A. Zisserman, "Multiple View Geometry". One
 /// solution, or `None` for fewer than six rays, and where the system is rank-deficient: coplanar points, or rays that
 /// all meet in one point. Signs of depths are not imposed; λ > 0 is for the caller to test.
 pub fn dlt(

@@ -68,7 +68,7 @@ pub fn max_triangulation_angle(rays: &[WorldRay], point_in_world: &Vector3<f64>)
 ///
 /// One bearing is first turned by the smallest angle that brings both into a common epipolar plane, where the rays
 /// meet: S. H. Lee, J. Civera, "Closed-Form Optimal Two-View Triangulation Based on Angular Errors", ICCV 2019, the L1
-/// case (eqs. 12–14). `None` when a depth is not positive or the rays are parallel.
+/// case. `None` when a depth is not positive or the rays are parallel.
 pub fn triangulate_two_views(
     second_from_first: &Rigid,
     first: &Vector3<f64>,

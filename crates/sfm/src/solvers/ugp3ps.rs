@@ -11,10 +11,9 @@ use crate::Similarity;
 /// world. The components across each ray are linear in s, s·λ₁, cos θ and sin θ; eliminating the former two leaves two
 /// equations in (cos θ, sin θ), one more than unknowns.
 ///
-/// The problem of C. Sweeney et al., "Solving for Relative Pose with a Partially Known Rotation is a Quadratic
-/// Eigenvalue Problem", 3DV 2014, and "gDLS", ECCV 2014, with three points. The combination of the two equations that
-/// constrains the angle most is met exactly (two angles), a Gauss–Newton step on the angle weighs in the other. At most
-/// 2 solutions, the better one first. Degenerate when all rays meet in one point, and when the points lie on one
+/// The problem of gP4P+s (C. Sweeney et al., "gDLS: A Scalable Solution to the Generalized Pose and Scale Problem",
+/// ECCV 2014) with a known vertical. The combination of the two equations that constrains the angle most is met exactly
+/// (two angles), Gauss–Newton steps on the angle weigh in the other. At most 2 solutions, the better one first. Degenerate when all rays meet in one point, and when the points lie on one
 /// vertical.
 pub fn ugp3ps(
     origins_in_set: &[Vector3<f64>; 3],
