@@ -2,12 +2,15 @@
 //!
 //! Everything is drawn from the whole sphere: directions behind a camera are as frequent as any other.
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{UnitQuaternion, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::robust::GeneralizedRay;
 use crate::{Rigid, Similarity};
+
+/// Origins, directions and points of `N` rays.
+pub type RaySample<const N: usize> = ([Vector3<f64>; N], [Vector3<f64>; N], [Vector3<f64>; N]);
 
 /// A generator whose seed is derived from a name, so that tests do not share their draws (FNV-1a).
 pub fn seeded(name: &str) -> ChaCha8Rng {
@@ -131,7 +134,8 @@ impl AbsoluteProblem {
         let wrong = (outlier_fraction * self.bearings.len() as f64).round() as usize;
         for i in 0..self.bearings.len() {
             self.outlier[i] = i < wrong;
-            self.bearings[i] = if i < wrong { random_unit(rng) } else { perturb(rng, &self.bearings[i], sigma) };
+            self.bearings[i] =
+                if i < wrong { random_unit(rng) } else { perturb(rng, &self.bearings[i], sigma) };
         }
     }
 }
@@ -156,7 +160,9 @@ impl GeneralizedProblem {
     /// 0.2 to 5, the rotation uniformly, or about +z only when `upright`.
     pub fn exact(rng: &mut impl Rng, camera_of_ray: &[u32], upright: bool) -> Self {
         let rotation = if upright {
-            UnitQuaternion::from_scaled_axis(Vector3::z() * rng.random_range(-3.14..3.14))
+            UnitQuaternion::from_scaled_axis(
+                Vector3::z() * rng.random_range(-1.0..1.0) * std::f64::consts::PI,
+            )
         } else {
             random_rotation(rng)
         };
@@ -196,7 +202,7 @@ impl GeneralizedProblem {
     ///
     /// # Panics
     /// When there are fewer.
-    pub fn sample<const N: usize>(&self) -> ([Vector3<f64>; N], [Vector3<f64>; N], [Vector3<f64>; N]) {
+    pub fn sample<const N: usize>(&self) -> RaySample<N> {
         (
             std::array::from_fn(|i| self.rays[i].origin),
             std::array::from_fn(|i| self.rays[i].direction),
@@ -210,4 +216,49 @@ pub fn same_similarity(a: &Similarity, b: &Similarity, tolerance: f64) -> bool {
     rotation_angle(&a.rotation, &b.rotation) < tolerance
         && (a.scale / b.scale).ln().abs() < tolerance
         && (a.translation - b.translation).norm() < tolerance * (1.0 + b.translation.norm())
+}
+
+/// A pinhole camera of unknown focal length.
+#[derive(Debug, Clone)]
+pub struct FocalProblem {
+    /// Truth.
+    pub world_from_camera: Rigid,
+    /// Focal length in pixels, 400 to 2000.
+    pub focal: f64,
+    /// Pixels relative to the principal point, within ±500.
+    pub pixels: Vec<Vector2<f64>>,
+    /// Points in the world.
+    pub points: Vec<Vector3<f64>>,
+    /// Whether a pixel is wrong.
+    pub outlier: Vec<bool>,
+}
+
+impl FocalProblem {
+    /// Noise-free pixels of points at depths of 2 to 10.
+    pub fn exact(rng: &mut impl Rng, count: usize) -> Self {
+        let world_from_camera = Rigid::new(random_rotation(rng), normal_vector(rng) * 5.0);
+        let focal = rng.random_range(400.0..2000.0);
+        let (mut pixels, mut points) = (Vec::with_capacity(count), Vec::with_capacity(count));
+        for _ in 0..count {
+            let pixel = Vector2::new(rng.random_range(-500.0..500.0), rng.random_range(-500.0..500.0));
+            let depth = rng.random_range(2.0..10.0);
+            let point = Vector3::new(pixel.x / focal, pixel.y / focal, 1.0) * depth;
+            pixels.push(pixel);
+            points.push(world_from_camera.transform_point(&point));
+        }
+        Self { world_from_camera, focal, pixels, points, outlier: vec![false; count] }
+    }
+
+    /// Adds noise of `sigma` pixels per axis and replaces a fraction of the pixels by random ones.
+    pub fn disturb(&mut self, rng: &mut impl Rng, sigma: f64, outlier_fraction: f64) {
+        let wrong = (outlier_fraction * self.pixels.len() as f64).round() as usize;
+        for i in 0..self.pixels.len() {
+            self.outlier[i] = i < wrong;
+            self.pixels[i] = if i < wrong {
+                Vector2::new(rng.random_range(-500.0..500.0), rng.random_range(-500.0..500.0))
+            } else {
+                self.pixels[i] + Vector2::new(normal(rng), normal(rng)) * sigma
+            };
+        }
+    }
 }

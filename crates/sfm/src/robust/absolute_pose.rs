@@ -67,7 +67,10 @@ struct CameraFromWorld {
 impl CameraFromWorld {
     fn new(world_from_camera: &Rigid) -> Self {
         let inverse = world_from_camera.inverse();
-        Self { rotation: inverse.rotation.to_rotation_matrix().into_inner(), translation: inverse.translation }
+        Self {
+            rotation: inverse.rotation.to_rotation_matrix().into_inner(),
+            translation: inverse.translation,
+        }
     }
 
     fn world_from_camera(&self) -> Rigid {
@@ -225,7 +228,8 @@ mod tests {
             let mut problem = AbsoluteProblem::exact(&mut rng, 60);
             problem.disturb(&mut rng, 1e-3, 1.0);
             let params = RansacParams { max_iterations: 1000, min_inliers: 8, ..RansacParams::default() };
-            let found = estimate_absolute_pose(&params, &problem.bearings, &[1e-3; 60], &problem.points, seed);
+            let found =
+                estimate_absolute_pose(&params, &problem.bearings, &[1e-3; 60], &problem.points, seed);
             assert!(found.is_none());
         }
     }

@@ -47,7 +47,11 @@ pub(super) fn cauchy(squared: f64, inverse_scale_squared: f64) -> (f64, f64) {
 }
 
 /// Levenberg–Marquardt with Marquardt's diagonal damping; never returns a model of higher cost.
-pub(super) fn minimize<const D: usize, P: LeastSquares<D>>(problem: &P, initial: P::Model, max_steps: usize) -> P::Model
+pub(super) fn minimize<const D: usize, P: LeastSquares<D>>(
+    problem: &P,
+    initial: P::Model,
+    max_steps: usize,
+) -> P::Model
 where
     Const<D>: DimMin<Const<D>, Output = Const<D>>,
 {

@@ -20,7 +20,13 @@ pub struct RansacParams {
 
 impl Default for RansacParams {
     fn default() -> Self {
-        Self { max_error_sigma: 4.0, min_iterations: 50, max_iterations: 20_000, confidence: 0.9999, min_inliers: 6 }
+        Self {
+            max_error_sigma: 4.0,
+            min_iterations: 50,
+            max_iterations: 20_000,
+            confidence: 0.9999,
+            min_inliers: 6,
+        }
     }
 }
 
@@ -42,10 +48,16 @@ impl RansacParams {
     /// # Errors
     /// The first field out of its range.
     pub fn validate(&self) -> Result<(), InvalidParams> {
-        let check = |ok, field, range, value| if ok { Ok(()) } else { Err(InvalidParams { field, range, value }) };
+        let check =
+            |ok, field, range, value| if ok { Ok(()) } else { Err(InvalidParams { field, range, value }) };
         let max_error = self.max_error_sigma;
         check(max_error > 0.0 && max_error.is_finite(), "max_error_sigma", "positive", max_error)?;
-        check(self.confidence > 0.0 && self.confidence < 1.0, "confidence", "within (0, 1)", self.confidence)?;
+        check(
+            self.confidence > 0.0 && self.confidence < 1.0,
+            "confidence",
+            "within (0, 1)",
+            self.confidence,
+        )?;
         check(self.max_iterations > 0, "max_iterations", "at least 1", f64::from(self.max_iterations))?;
         check(
             self.min_iterations <= self.max_iterations,
@@ -98,7 +110,11 @@ const WIDENING: f64 = 3.0;
 /// MLESAC, 2000), non-linear local optimization, and the usual adaptive stop.
 ///
 /// Scores are in units of the squared bound: the sum over the data of min(r²/bound², 1).
-pub(super) fn lo_ransac<C: Consensus>(params: &RansacParams, problem: &mut C, seed: u64) -> Option<Consented<C::Model>> {
+pub(super) fn lo_ransac<C: Consensus>(
+    params: &RansacParams,
+    problem: &mut C,
+    seed: u64,
+) -> Option<Consented<C::Model>> {
     let count = problem.len();
     let needed = params.min_inliers.max(problem.sample_size());
     if count < needed {

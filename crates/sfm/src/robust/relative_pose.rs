@@ -92,7 +92,8 @@ pub fn estimate_rotation(
     sigmas_second: &[f64],
     seed: u64,
 ) -> Option<RotationEstimate> {
-    let mut problem = RotationConsensus(RelativeConsensus::new(params, first, second, sigmas_first, sigmas_second)?);
+    let mut problem =
+        RotationConsensus(RelativeConsensus::new(params, first, second, sigmas_first, sigmas_second)?);
     let found = lo_ransac(params, &mut problem, seed)?;
     Some(RotationEstimate {
         second_from_first: Rigid::from_matrix(&found.model, Vector3::zeros()).rotation,
@@ -231,7 +232,8 @@ impl LeastSquares<5> for RelativeFit<'_> {
         for index in self.inliers {
             let i = *index as usize;
             let term = self.data.sampson(model, i);
-            let (turn, shift) = sampson_derivative(&term, &self.data.second[i], &model.translation, self.data.variances[i]);
+            let (turn, shift) =
+                sampson_derivative(&term, &self.data.second[i], &model.translation, self.data.variances[i]);
             let value = term.error / term.variance.sqrt();
             let (loss, weight) = cauchy(value * value, self.data.inverse_scale_squared);
             cost += loss;
@@ -404,7 +406,8 @@ mod tests {
         let fit = RelativeFit { data: &data, inliers: &[] };
         for i in 0..30 {
             let term = data.sampson(&model, i);
-            let (turn, shift) = sampson_derivative(&term, &problem.second[i], &model.translation, data.variances[i]);
+            let (turn, shift) =
+                sampson_derivative(&term, &problem.second[i], &model.translation, data.variances[i]);
             let (u, v) = tangent_basis(&model.translation);
             let row = [turn.x, turn.y, turn.z, shift.dot(&u), shift.dot(&v)];
             for k in 0..5 {
@@ -428,7 +431,13 @@ mod tests {
         let second: Vec<_> = first
             .iter()
             .enumerate()
-            .map(|(i, x)| if i < 20 { random_unit(&mut rng) } else { crate::synthetic::perturb(&mut rng, &(rotation * x), SIGMA) })
+            .map(|(i, x)| {
+                if i < 20 {
+                    random_unit(&mut rng)
+                } else {
+                    crate::synthetic::perturb(&mut rng, &(rotation * x), SIGMA)
+                }
+            })
             .collect();
         let params = RansacParams::default();
         let sigmas = [SIGMA; 80];

@@ -74,6 +74,8 @@ mod tests {
         let bearing = Vector3::new(0.0, 0.6, -0.8);
         assert!(AngularResidual::squared(&bearing, &(bearing * 7.0), 1.0) < 1e-14);
         assert!(AngularResidual::squared(&bearing, &(bearing * -7.0), 1.0) > 1e12);
-        assert!(AngularResidual::new(&bearing, &(bearing * -7.0 + Vector3::x() * 1e-3), 1.0).value.norm() > 1e3);
+        assert!(
+            AngularResidual::new(&bearing, &(bearing * -7.0 + Vector3::x() * 1e-3), 1.0).value.norm() > 1e3
+        );
     }
 }

@@ -1,5 +1,6 @@
 use nalgebra::{Matrix3, Vector3};
 
+use super::null_space::null_space;
 use super::{Solutions, real_roots};
 
 /// Index of the product of two of (x, y, z, 1) among x², xy, xz, y², yz, z², x, y, z, 1.
@@ -34,7 +35,7 @@ type Cubic = [f64; 20];
 /// are allowed; degenerate for a pure rotation (any t) and for fewer than five independent pairs.
 pub fn five_point(first: &[Vector3<f64>; 5], second: &[Vector3<f64>; 5]) -> Solutions<Matrix3<f64>, 10> {
     let mut solutions = Solutions::default();
-    let basis = null_space(first, second);
+    let basis = epipolar_null_space(first, second);
     let constraints = constraint_matrix(&basis);
     let Some(reduced) = eliminate(constraints) else {
         return solutions;
@@ -44,12 +45,7 @@ pub fn five_point(first: &[Vector3<f64>; 5], second: &[Vector3<f64>; 5]) -> Solu
     for (row, target) in b.iter_mut().enumerate() {
         let (e, f) = (&reduced[2 * row], &reduced[2 * row + 1]);
         for (column, out) in [(0, &mut target.0), (3, &mut target.1)] {
-            *out = [
-                e[column + 2],
-                e[column + 1] - f[column + 2],
-                e[column] - f[column + 1],
-                -f[column],
-            ];
+            *out = [e[column + 2], e[column + 1] - f[column + 2], e[column] - f[column + 1], -f[column]];
         }
         target.2 = [e[9], e[8] - f[9], e[7] - f[8], e[6] - f[7], -f[6]];
     }
@@ -82,44 +78,17 @@ pub fn five_point(first: &[Vector3<f64>; 5], second: &[Vector3<f64>; 5]) -> Solu
     solutions
 }
 
-/// Orthonormal basis of the matrices with x₂ᵀ·E·x₁ = 0, by Householder reflections.
-fn null_space(first: &[Vector3<f64>; 5], second: &[Vector3<f64>; 5]) -> [Matrix3<f64>; 4] {
-    let mut columns = [[0.0; 9]; 5];
-    for (column, (a, b)) in columns.iter_mut().zip(first.iter().zip(second)) {
+/// Orthonormal basis of the matrices with x₂ᵀ·E·x₁ = 0.
+fn epipolar_null_space(first: &[Vector3<f64>; 5], second: &[Vector3<f64>; 5]) -> [Matrix3<f64>; 4] {
+    let mut constraints = [[0.0; 9]; 5];
+    for (constraint, (a, b)) in constraints.iter_mut().zip(first.iter().zip(second)) {
         for i in 0..3 {
             for j in 0..3 {
-                column[3 * i + j] = b[i] * a[j];
+                constraint[3 * i + j] = b[i] * a[j];
             }
         }
     }
-    let mut beta = [0.0; 5];
-    for k in 0..5 {
-        let norm = columns[k][k..].iter().map(|v| v * v).sum::<f64>().sqrt();
-        let alpha = -norm.copysign(columns[k][k]);
-        columns[k][k] -= alpha;
-        let square = columns[k][k..].iter().map(|v| v * v).sum::<f64>();
-        beta[k] = if square > 0.0 { 2.0 / square } else { 0.0 };
-        let reflector = columns[k];
-        for other in &mut columns[k + 1..] {
-            let dot = (k..9).map(|i| reflector[i] * other[i]).sum::<f64>() * beta[k];
-            for i in k..9 {
-                other[i] -= dot * reflector[i];
-            }
-        }
-    }
-    let mut basis = [Matrix3::zeros(); 4];
-    for (n, matrix) in basis.iter_mut().enumerate() {
-        let mut vector = [0.0; 9];
-        vector[5 + n] = 1.0;
-        for k in (0..5).rev() {
-            let dot = (k..9).map(|i| columns[k][i] * vector[i]).sum::<f64>() * beta[k];
-            for i in k..9 {
-                vector[i] -= dot * columns[k][i];
-            }
-        }
-        *matrix = Matrix3::from_row_slice(&vector);
-    }
-    basis
+    null_space(constraints).map(|vector| Matrix3::from_row_slice(vector.as_slice()))
 }
 
 #[inline(always)]

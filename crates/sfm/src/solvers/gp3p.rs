@@ -35,8 +35,17 @@ pub fn gp3p(
         let p = (origins_in_set[i] - origins_in_set[0]) / unit;
         for (row, n) in [(2 * i - 2, u), (2 * i - 1, v)] {
             rows[row] = [
-                n.dot(&first), n.x * x.x, n.x * x.y, n.x * x.z, n.y * x.x, n.y * x.y, n.y * x.z, n.z * x.x, n.z * x.y,
-                n.z * x.z, -n.dot(&p),
+                n.dot(&first),
+                n.x * x.x,
+                n.x * x.y,
+                n.x * x.z,
+                n.y * x.x,
+                n.y * x.y,
+                n.y * x.z,
+                n.z * x.x,
+                n.z * x.y,
+                n.z * x.z,
+                -n.dot(&p),
             ];
         }
     }

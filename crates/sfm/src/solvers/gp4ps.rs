@@ -41,8 +41,17 @@ pub fn gp4ps(
         let p = (origins_in_set[i] - origins_in_set[0]) / reach;
         for (row, n) in [(2 * i - 2, u), (2 * i - 1, v)] {
             rows[row] = [
-                n.dot(&first), -n.dot(&p), n.x * x.x, n.x * x.y, n.x * x.z, n.y * x.x, n.y * x.y, n.y * x.z, n.z * x.x,
-                n.z * x.y, n.z * x.z,
+                n.dot(&first),
+                -n.dot(&p),
+                n.x * x.x,
+                n.x * x.y,
+                n.x * x.z,
+                n.y * x.x,
+                n.y * x.y,
+                n.y * x.z,
+                n.z * x.x,
+                n.z * x.y,
+                n.z * x.z,
             ];
         }
     }
@@ -91,6 +100,8 @@ pub fn gp4ps(
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector3;
+
     use super::gp4ps;
     use crate::synthetic::{GeneralizedProblem, same_similarity, seeded};
 
@@ -114,15 +125,43 @@ mod tests {
 
     #[test]
     fn finds_the_truth_when_rays_share_a_centre() {
-        for (name, cameras) in [("211", [0, 0, 1, 2]), ("121", [0, 1, 1, 2]), ("22", [0, 0, 1, 1]), ("31", [0, 0, 0, 1]), ("13", [0, 1, 1, 1])] {
+        for (name, cameras) in [
+            ("211", [0, 0, 1, 2]),
+            ("121", [0, 1, 1, 2]),
+            ("22", [0, 0, 1, 1]),
+            ("31", [0, 0, 0, 1]),
+            ("13", [0, 1, 1, 1]),
+        ] {
             let missed = missed(name, cameras);
             assert!(missed <= 10, "{name}: {missed}");
         }
     }
 
     #[test]
+    fn half_turns_and_axis_aligned_frames_are_no_special_case() {
+        let mut rng = seeded("half turns");
+        for axis in [Vector3::x(), Vector3::y(), Vector3::z(), Vector3::new(1.0, 1.0, 1.0).normalize()] {
+            for angle in [0.0, 0.5, 1.0, 1.5, 2.0 / 3.0].map(|turn| turn * std::f64::consts::PI) {
+                let mut problem = GeneralizedProblem::exact(&mut rng, &[0, 1, 2, 2], false);
+                let from_world = problem.world_from_set.inverse();
+                problem.world_from_set.rotation = nalgebra::UnitQuaternion::from_scaled_axis(axis * angle);
+                let (origins, directions, mut points) = problem.sample::<4>();
+                for point in &mut points {
+                    *point = problem.world_from_set.transform_point(&from_world.transform_point(point));
+                }
+                let found = gp4ps(&origins, &directions, &points);
+                assert!(
+                    found.iter().any(|s| same_similarity(s, &problem.world_from_set, 1e-7)),
+                    "{axis} {angle}"
+                );
+            }
+        }
+    }
+
+    #[test]
     fn one_centre_leaves_the_scale_free() {
-        let (origins, directions, points) = GeneralizedProblem::exact(&mut seeded("4"), &[0; 4], false).sample();
+        let (origins, directions, points) =
+            GeneralizedProblem::exact(&mut seeded("4"), &[0; 4], false).sample();
         assert!(gp4ps(&origins, &directions, &points).is_empty());
     }
 }

@@ -124,11 +124,7 @@ fn split_conic(conic: &Matrix3<f64>) -> Option<[Vector3<f64>; 2]> {
     if diagonal < -DOUBLE_ROOT * size {
         return None;
     }
-    let p = if diagonal > 1e-30 * size {
-        -adjugate.column(k) / diagonal.sqrt()
-    } else {
-        Vector3::zeros()
-    };
+    let p = if diagonal > 1e-30 * size { -adjugate.column(k) / diagonal.sqrt() } else { Vector3::zeros() };
     let product = conic + p.cross_matrix();
     let mut best = (0, 0);
     for i in 0..3 {
@@ -247,7 +243,8 @@ mod tests {
 
     #[test]
     fn exact_data_give_nine_digits() {
-        let bearings = [Vector3::new(0.0, 0.6, -0.8), Vector3::new(1.0, 0.0, 0.0), Vector3::new(-0.6, -0.8, 0.0)];
+        let bearings =
+            [Vector3::new(0.0, 0.6, -0.8), Vector3::new(1.0, 0.0, 0.0), Vector3::new(-0.6, -0.8, 0.0)];
         let pose = crate::Rigid::new(
             nalgebra::UnitQuaternion::from_scaled_axis(Vector3::new(0.3, -2.0, 1.0)),
             Vector3::new(4.0, 5.0, -6.0),

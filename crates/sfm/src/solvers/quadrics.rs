@@ -123,7 +123,10 @@ pub(super) fn intersect_quadrics(quadrics: &[Quadric; 3]) -> Solutions<Vector3<f
 pub(super) fn evaluate_quadric(q: &Quadric, p: &Vector3<f64>) -> (f64, Vector3<f64>) {
     let (x, y, z) = (p.x, p.y, p.z);
     (
-        (q[0] * x + q[1] * y + q[2] * z + q[6]) * x + (q[3] * y + q[4] * z + q[7]) * y + (q[5] * z + q[8]) * z + q[9],
+        (q[0] * x + q[1] * y + q[2] * z + q[6]) * x
+            + (q[3] * y + q[4] * z + q[7]) * y
+            + (q[5] * z + q[8]) * z
+            + q[9],
         Vector3::new(
             2.0 * q[0] * x + q[1] * y + q[2] * z + q[6],
             q[1] * x + 2.0 * q[3] * y + q[4] * z + q[7],

@@ -2,15 +2,16 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use super::quadrics::Quadric;
 
-/// A fixed generic rotation (unit quaternion w, x, y, z).
+/// Cayley's parameters of a fixed generic rotation.
 ///
 /// Cayley's parametrization has no half turns, which upright frames that look at each other do have: world points are
-/// turned by this first.
-const GENERIC: [f64; 4] = [0.730_296_743_340_221_4, 0.182_574_185_835_055_37, 0.365_148_371_670_110_74, 0.547_722_557_505_166_1];
+/// turned by this first. No product with one of the 24 axis permutations is a half turn.
+const GENERIC: [f64; 3] = [0.2, 0.35, 0.6];
 
 /// The generic rotation as a matrix.
 pub(super) fn generic_rotation() -> Matrix3<f64> {
-    cayley_numerator(&(Vector3::new(GENERIC[1], GENERIC[2], GENERIC[3]) / GENERIC[0])) * (GENERIC[0] * GENERIC[0])
+    let v = Vector3::from(GENERIC);
+    cayley_numerator(&v) / (1.0 + v.norm_squared())
 }
 
 /// (1 + ‖v‖²)·R for the rotation with quaternion ∝ (1, v).
@@ -58,7 +59,10 @@ pub(super) fn inverse_rotation(set_from_world: &Matrix3<f64>) -> UnitQuaternion<
 ///
 /// Returns `false` when a column depends on the earlier ones (relative to the matrix's size).
 #[inline(always)]
-pub(super) fn eliminate_columns<const M: usize, const N: usize>(rows: &mut [[f64; N]; M], columns: usize) -> bool {
+pub(super) fn eliminate_columns<const M: usize, const N: usize>(
+    rows: &mut [[f64; N]; M],
+    columns: usize,
+) -> bool {
     for k in 0..columns {
         let total: f64 = rows.iter().map(|row| row[k] * row[k]).sum();
         let below: f64 = rows[k..].iter().map(|row| row[k] * row[k]).sum();

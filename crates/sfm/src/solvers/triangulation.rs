@@ -45,7 +45,11 @@ pub fn angle(a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
 }
 
 /// The angle under which two centres see a point, in radians.
-pub fn triangulation_angle(first: &Vector3<f64>, second: &Vector3<f64>, point_in_world: &Vector3<f64>) -> f64 {
+pub fn triangulation_angle(
+    first: &Vector3<f64>,
+    second: &Vector3<f64>,
+    point_in_world: &Vector3<f64>,
+) -> f64 {
     angle(&(first - point_in_world), &(second - point_in_world))
 }
 
@@ -64,7 +68,7 @@ pub fn max_triangulation_angle(rays: &[WorldRay], point_in_world: &Vector3<f64>)
 ///
 /// One bearing is first turned by the smallest angle that brings both into a common epipolar plane, where the rays
 /// meet: S. H. Lee, J. Civera, "Closed-Form Optimal Two-View Triangulation Based on Angular Errors", ICCV 2019, the L1
-/// case (eqs. 12–14). `None` when a depth is not positive or the rays are parallel.
+/// case. `None` when a depth is not positive or the rays are parallel.
 pub fn triangulate_two_views(
     second_from_first: &Rigid,
     first: &Vector3<f64>,
@@ -170,7 +174,8 @@ mod tests {
         for _ in 0..300 {
             let problem = RelativeProblem::exact(&mut rng, 1);
             let point =
-                triangulate_two_views(&problem.second_from_first, &problem.first[0], &problem.second[0]).unwrap();
+                triangulate_two_views(&problem.second_from_first, &problem.first[0], &problem.second[0])
+                    .unwrap();
             assert!(angle(&point, &problem.second[0]) < 1e-9);
             let in_first = problem.second_from_first.inverse_transform_point(&point);
             assert!(angle(&in_first, &problem.first[0]) < 1e-9);
@@ -217,7 +222,11 @@ mod tests {
 
     #[test]
     fn refuses_parallel_rays_and_points_behind_a_ray() {
-        let ray = |x: f64, direction: Vector3<f64>| WorldRay { origin: Vector3::new(x, 0.0, 0.0), direction, sigma: 1e-3 };
+        let ray = |x: f64, direction: Vector3<f64>| WorldRay {
+            origin: Vector3::new(x, 0.0, 0.0),
+            direction,
+            sigma: 1e-3,
+        };
         assert!(triangulate(&[ray(0.0, Vector3::z()), ray(1.0, Vector3::z())]).is_none());
         assert!(triangulate(&[ray(0.0, Vector3::z())]).is_none());
         let point = Vector3::new(0.5, 0.0, 3.0);
