@@ -18,6 +18,7 @@
 //!
 //! Work runs on the current rayon pool; results are the same bytes for any number of threads.
 
+pub mod bal;
 mod camera_system;
 mod levenberg_marquardt;
 mod loss;
@@ -30,7 +31,7 @@ mod spherical;
 use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
 
-use levenberg_marquardt::{Limits, minimize};
+use levenberg_marquardt::{Limits, Outcome, minimize};
 use normal_equations::NormalEquations;
 use spherical::{Layout, POSE_DIM, Spherical};
 
@@ -89,6 +90,21 @@ pub struct BundleReport {
     pub degrees_of_freedom: i64,
 }
 
+impl BundleReport {
+    fn new(outcome: &Outcome, observations: usize, ignored: usize, degrees_of_freedom: i64) -> Self {
+        Self {
+            initial_cost: outcome.initial_cost,
+            final_cost: outcome.final_cost,
+            iterations: outcome.iterations,
+            accepted_steps: outcome.accepted,
+            termination: outcome.termination,
+            observations,
+            ignored,
+            degrees_of_freedom,
+        }
+    }
+}
+
 /// Minimizes the cost of a problem in place.
 ///
 /// What is fixed stays bit-identical, as does everything when no step decreases the cost. Never fails: a problem
@@ -101,32 +117,12 @@ pub fn solve(params: &BundleParams, problem: &mut BundleProblem) -> BundleReport
     let mut equations =
         NormalEquations::<POSE_DIM>::new(links, points, free, model.block_count(), &extra_dims);
     let unknowns = equations.unknowns();
-    let mut report = BundleReport {
-        initial_cost: 0.0,
-        final_cost: 0.0,
-        iterations: 0,
-        accepted_steps: 0,
-        termination: Termination::NothingToDo,
-        observations,
-        ignored,
-        degrees_of_freedom: (2 * observations + 3 * priors) as i64 - unknowns as i64,
+    let degrees_of_freedom = (2 * observations + 3 * priors) as i64 - unknowns as i64;
+    let outcome = if unknowns == 0 {
+        Outcome::nothing_to_do(equations.linearize(&model))
+    } else {
+        minimize(&mut model, &mut equations, &Limits::from(params))
     };
-    if unknowns == 0 {
-        report.initial_cost = equations.linearize(&model);
-        report.final_cost = report.initial_cost;
-        return report;
-    }
-    let limits = Limits {
-        max_iterations: params.max_iterations,
-        function_tolerance: params.function_tolerance,
-        parameter_tolerance: params.parameter_tolerance,
-    };
-    let outcome = minimize(&mut model, &mut equations, &limits);
-    report.initial_cost = outcome.initial_cost;
-    report.final_cost = outcome.final_cost;
-    report.iterations = outcome.iterations;
-    report.accepted_steps = outcome.accepted;
-    report.termination = outcome.termination;
     if outcome.accepted > 0 {
         model.store(problem);
         for (&index, position) in point_of_index.iter().zip(equations.points()) {
@@ -136,7 +132,7 @@ pub fn solve(params: &BundleParams, problem: &mut BundleProblem) -> BundleReport
             }
         }
     }
-    report
+    BundleReport::new(&outcome, observations, ignored, degrees_of_freedom)
 }
 
 /// Marginal covariances of poses, 6×6 each, in the order asked for.

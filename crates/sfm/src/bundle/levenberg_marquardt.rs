@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::BundleParams;
 use super::normal_equations::{Model, NormalEquations};
 
 /// Damping of the first step.
@@ -21,7 +22,7 @@ pub enum Termination {
     IterationLimit,
     /// No step decreased the cost although one was predicted to.
     NoDecrease,
-    /// Nothing is free, or nothing constrains it.
+    /// Nothing that is free is constrained.
     NothingToDo,
     /// The initial state has no finite cost.
     NotFinite,
@@ -35,6 +36,16 @@ pub(super) struct Limits {
     pub parameter_tolerance: f64,
 }
 
+impl From<&BundleParams> for Limits {
+    fn from(params: &BundleParams) -> Self {
+        Self {
+            max_iterations: params.max_iterations,
+            function_tolerance: params.function_tolerance,
+            parameter_tolerance: params.parameter_tolerance,
+        }
+    }
+}
+
 /// What the iterations did.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Outcome {
@@ -43,6 +54,14 @@ pub(super) struct Outcome {
     pub iterations: u32,
     pub accepted: u32,
     pub termination: Termination,
+}
+
+impl Outcome {
+    /// The outcome of a problem without unknowns.
+    pub fn nothing_to_do(cost: f64) -> Self {
+        let termination = Termination::NothingToDo;
+        Self { initial_cost: cost, final_cost: cost, iterations: 0, accepted: 0, termination }
+    }
 }
 
 /// Minimizes the cost; the best state is the model's and the equations' current one.
