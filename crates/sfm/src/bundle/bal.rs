@@ -9,7 +9,7 @@ use std::str::FromStr;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use super::levenberg_marquardt::{Limits, minimize};
-use super::normal_equations::{Linearized, Link, Model, NormalEquations};
+use super::normal_equations::{BlockTerm, Linearized, Link, Model, NormalEquations};
 use super::{BundleParams, BundleReport, RobustLoss};
 
 /// Scalars of a camera: rotation (left perturbation), translation, f, k₁, k₂.
@@ -199,7 +199,7 @@ impl Model<CAMERA_DIM> for BalModel {
         x * x + y * y
     }
 
-    fn linearize_block_terms(&self, _: &mut dyn FnMut(usize, &[[f64; 9]; 9], &[f64; 9])) -> f64 {
+    fn linearize_block_terms(&self, _: BlockTerm<'_, CAMERA_DIM>) -> f64 {
         0.0
     }
 
@@ -359,9 +359,9 @@ mod tests {
             for k in 0..12 {
                 let (mut step, mut shift) = ([0.0; 9], Vector3::zeros());
                 if k < 9 {
-                    step[k] = h
+                    step[k] = h;
                 } else {
-                    shift[k - 9] = h
+                    shift[k - 9] = h;
                 }
                 let (after, before) =
                     (at(observation, &step, shift), at(observation, &step.map(|s| -s), -shift));

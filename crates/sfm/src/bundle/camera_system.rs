@@ -15,6 +15,7 @@ const DENSE_SIZE: usize = 600;
 /// Share of the lower triangle above which the dense factorization wins at any size.
 const DENSE_FILL: f64 = 0.4;
 
+#[expect(clippy::large_enum_variant, reason = "one per problem, never moved in a loop")]
 /// A factorization whose memory and symbolic analysis are reused over all iterations.
 pub(super) enum CameraSystem {
     /// Cholesky in place on a full matrix.

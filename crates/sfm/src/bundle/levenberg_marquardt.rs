@@ -91,7 +91,7 @@ pub(super) fn minimize<const D: usize, M: Model<D>>(
         let sums = if equations.factorize(lambda) { equations.solve(lambda) } else { None };
         if let Some(sums) = sums {
             // Below this neither the costs' difference nor the decision by it means anything.
-            if !(sums.predicted > f64::EPSILON * cost) {
+            if sums.predicted <= f64::EPSILON * cost {
                 outcome.termination = Termination::Converged;
                 break;
             }

@@ -53,6 +53,9 @@ pub(super) struct Linearized<const D: usize> {
     pub extra: [[f64; MAX_CAMERA_PARAMS]; 2],
 }
 
+/// Takes block, JᵀJ and Jᵀr of a term of that block alone.
+pub(super) type BlockTerm<'a, const D: usize> = &'a mut dyn FnMut(usize, &[[f64; D]; D], &[f64; D]);
+
 /// A bundle problem: state, candidate state, residuals.
 pub(super) trait Model<const D: usize>: Sync {
     /// Loss of all observations.
@@ -62,7 +65,7 @@ pub(super) trait Model<const D: usize>: Sync {
     /// ‖r‖² at the candidate state.
     fn squared_residual(&self, observation: usize, point: &Vector3<f64>) -> f64;
     /// Calls `add(block, h, g)` with the (weighted) JᵀJ and Jᵀr of terms of a single block; returns their cost.
-    fn linearize_block_terms(&self, add: &mut dyn FnMut(usize, &[[f64; D]; D], &[f64; D])) -> f64;
+    fn linearize_block_terms(&self, add: BlockTerm<'_, D>) -> f64;
     /// Cost of these terms at the candidate state.
     fn block_terms_cost(&self) -> f64;
     /// Sets the candidate to current ⊞ step (all blocks, then all extra blocks); false when that is no valid state.
@@ -419,7 +422,7 @@ impl<const D: usize> NormalEquations<D> {
         }
         let Self { slot_starts, slots, free, block_count, pattern, chunks, .. } = self;
         for_each_chunk(chunks, |chunk| {
-            eliminate::<D>(chunk, lambda, slot_starts, slots, free, *block_count, pattern)
+            eliminate::<D>(chunk, lambda, slot_starts, slots, free, *block_count, pattern);
         });
         if !self.chunks.iter().all(|chunk| chunk.usable) {
             return false;
@@ -466,7 +469,7 @@ impl<const D: usize> NormalEquations<D> {
         }
         let Self { slot_starts, slots, points, free, pattern, chunks, step, .. } = self;
         for_each_chunk(chunks, |chunk| {
-            substitute(chunk, lambda, step, points, slot_starts, slots, free, pattern)
+            substitute(chunk, lambda, step, points, slot_starts, slots, free, pattern);
         });
         let mut sums = StepSums::default();
         for ((step, gradient), damping) in self.step.iter().zip(&self.gradient).zip(&self.damping) {

@@ -12,7 +12,7 @@ use nalgebra::{Matrix3, Vector3};
 /// Below this 1 + b·d (within 0.14 mrad of the antipode) the residual is held at [`ANTIPODE_NORM`].
 const ANTIPODE_GAP: f64 = 1e-8;
 /// ‖e‖ at 1 + b·d = [`ANTIPODE_GAP`].
-const ANTIPODE_NORM: f64 = 28284.271247461902;
+const ANTIPODE_NORM: f64 = 28284.2712474619;
 
 /// An orthonormal, right-handed basis (u, v) of the plane perpendicular to a unit vector: u × v = b.
 ///
@@ -52,7 +52,7 @@ pub(super) fn angular(bearing: &Vector3<f64>, x: &Vector3<f64>) -> Angular {
     let gap = 1.0 + bearing.dot(&d);
     let (u, v) = tangent_basis(bearing);
     let (eu, ev) = (u.dot(&d), v.dot(&d));
-    if !(gap > ANTIPODE_GAP) || !inverse_norm.is_finite() {
+    if gap <= ANTIPODE_GAP || !inverse_norm.is_finite() {
         // No usable derivative here; the constant keeps the observation from ever counting as explained.
         let norm = eu.hypot(ev);
         let residual = if norm > 0.0 {
@@ -61,7 +61,9 @@ pub(super) fn angular(bearing: &Vector3<f64>, x: &Vector3<f64>) -> Angular {
             [ANTIPODE_NORM, 0.0]
         };
         let zero = [Vector3::zeros(); 2];
-        return Angular { residual, wrt_camera_point: zero, wrt_direction: zero, direction: d };
+        // Finite, unlike d in the camera's centre.
+        let direction = -bearing;
+        return Angular { residual, wrt_camera_point: zero, wrt_direction: zero, direction };
     }
     let factor = 2.0 / gap;
     let residual = [factor * eu, factor * ev];
@@ -77,7 +79,7 @@ pub(super) fn angular_squared(bearing: &Vector3<f64>, x: &Vector3<f64>) -> f64 {
     let inverse_norm = 1.0 / x.norm();
     let d = x * inverse_norm;
     let gap = 1.0 + bearing.dot(&d);
-    if !(gap > ANTIPODE_GAP) || !inverse_norm.is_finite() {
+    if gap <= ANTIPODE_GAP || !inverse_norm.is_finite() {
         return ANTIPODE_NORM * ANTIPODE_NORM;
     }
     4.0 * bearing.cross(&d).norm_squared() / (gap * gap)
@@ -151,7 +153,7 @@ mod tests {
         for _ in 0..1000 {
             let b = random_vector(&mut rng).normalize();
             let axis = b.cross(&random_vector(&mut rng)).normalize();
-            let angle = rng.random_range(0.0..3.14);
+            let angle = rng.random_range(0.0..std::f64::consts::PI - 1e-3);
             let x = UnitQuaternion::from_scaled_axis(axis * angle) * b * rng.random_range(0.1..50.0);
             let e = angular(&b, &x).residual;
             let expected = 2.0 * (angle / 2.0).tan();

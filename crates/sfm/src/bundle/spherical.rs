@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector2, Vector3};
 use setloc_features::{Camera, CameraModel, MAX_CAMERA_PARAMS};
 
-use super::normal_equations::{Linearized, Link, Model};
+use super::normal_equations::{BlockTerm, Linearized, Link, Model};
 use super::pattern::NONE;
 use super::residual::{angular, angular_squared, bearing_change, point_row, rotation_row};
 use super::{BundleProblem, IntrinsicsFreedom, RobustLoss};
@@ -85,6 +85,13 @@ pub(super) struct Layout {
     pub ignored: usize,
     /// Priors used and weighed, of free poses.
     pub priors: usize,
+}
+
+impl Prior {
+    /// (t − p)/σ.
+    fn residual(&self, poses: &[PoseState]) -> Vector3<f64> {
+        (poses[self.pose as usize].world_from_camera.translation - self.position) * self.inverse_sigma
+    }
 }
 
 impl Spherical {
@@ -258,10 +265,6 @@ impl Spherical {
             problem.cameras[*camera as usize].clone_from(&self.cameras[*camera as usize]);
         }
     }
-
-    fn prior_residual(&self, prior: &Prior, poses: &[PoseState]) -> Vector3<f64> {
-        (poses[prior.pose as usize].world_from_camera.translation - prior.position) * prior.inverse_sigma
-    }
 }
 
 impl Model<POSE_DIM> for Spherical {
@@ -332,10 +335,10 @@ impl Model<POSE_DIM> for Spherical {
         angular_squared(&bearing, &x) * (weight * weight)
     }
 
-    fn linearize_block_terms(&self, add: &mut dyn FnMut(usize, &[[f64; 6]; 6], &[f64; 6])) -> f64 {
+    fn linearize_block_terms(&self, add: BlockTerm<'_, POSE_DIM>) -> f64 {
         let mut cost = 0.0;
         for prior in &self.priors {
-            let r = self.prior_residual(prior, &self.poses);
+            let r = prior.residual(&self.poses);
             let (rho, weight) = prior.loss.evaluate(r.norm_squared());
             cost += 0.5 * rho;
             let (mut hessian, mut gradient) = ([[0.0; 6]; 6], [0.0; 6]);
@@ -349,9 +352,8 @@ impl Model<POSE_DIM> for Spherical {
     }
 
     fn block_terms_cost(&self) -> f64 {
-        let cost = |prior: &Prior| {
-            0.5 * prior.loss.evaluate(self.prior_residual(prior, &self.candidate_poses).norm_squared()).0
-        };
+        let cost =
+            |prior: &Prior| 0.5 * prior.loss.evaluate(prior.residual(&self.candidate_poses).norm_squared()).0;
         self.priors.iter().map(cost).sum()
     }
 
