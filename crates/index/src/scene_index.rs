@@ -1,4 +1,4 @@
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 use rand::SeedableRng;
 use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
@@ -28,6 +28,8 @@ pub struct Row {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SceneIndex {
     positions: Vec<Vector3<f64>>,
+    /// What the scene's own rays leave undetermined of each position, in squared scene units.
+    covariances: Vec<Matrix3<f32>>,
     /// Camera centres by image id; `None` for images outside the model.
     centers: Vec<Option<Vector3<f64>>>,
     rows: Vec<Row>,
@@ -47,6 +49,7 @@ impl SceneIndex {
     pub fn build(params: &IndexParams, reconstruction: &Reconstruction, features: &[&ImageFeatures]) -> Self {
         let mut rows = Vec::with_capacity(reconstruction.observation_count());
         let mut descriptors = Vec::with_capacity(rows.capacity() * DESCRIPTOR_LEN);
+        let mut information = vec![Matrix3::zeros(); reconstruction.points.len()];
         for (point_index, point) in reconstruction.points.iter().enumerate() {
             for observation in &point.track {
                 let image = observation.image;
@@ -60,7 +63,14 @@ impl SceneIndex {
                 };
                 let keypoint = &image_features.keypoints[feature];
                 let angle = reconstruction.camera_of(image).pixel_angle(&keypoint.pixel()).unwrap_or(0.0);
-                let distance = (point.position - pose.translation).norm();
+                let offset = point.position - pose.translation;
+                let distance = offset.norm();
+                let sigma = angle * f64::from(keypoint.noise_px) * distance;
+                if sigma > 0.0 && sigma.is_finite() {
+                    let direction = offset / distance;
+                    information[point_index] +=
+                        (Matrix3::identity() - direction * direction.transpose()) / (sigma * sigma);
+                }
                 let extent = (f64::from(keypoint.size) * angle * distance) as f32;
                 rows.push(Row { point: PointId(point_index as u32), image, extent });
                 descriptors.extend_from_slice(image_features.descriptor(feature));
@@ -68,6 +78,7 @@ impl SceneIndex {
         }
         let mut index = Self {
             positions: reconstruction.points.iter().map(|point| point.position).collect(),
+            covariances: information.iter().map(position_covariance).collect(),
             centers: reconstruction
                 .images
                 .iter()
@@ -207,6 +218,13 @@ impl SceneIndex {
         self.positions[point.index()]
     }
 
+    /// Covariance of a position as the scene's own rays determine it, poses taken as exact; in squared scene units.
+    ///
+    /// Directions that no ray determines (the depth along parallel rays) get a hundred times the lateral deviation.
+    pub fn position_covariance(&self, point: PointId) -> Matrix3<f64> {
+        self.covariances[point.index()].cast()
+    }
+
     /// Camera centre of a scene image in the scene's frame, when it is part of the model.
     pub fn center(&self, image: ImageId) -> Option<Vector3<f64>> {
         self.centers.get(image.index()).copied().flatten()
@@ -263,6 +281,19 @@ impl SceneIndex {
                 .collect(),
         }
     }
+}
+
+/// Inverse of a position's information, regularized where rays are (nearly) parallel.
+///
+/// The depth along parallel rays is not determined; a hundred times the lateral uncertainty stands for it, so that
+/// matching still finds the point and estimation hardly trusts it.
+fn position_covariance(information: &Matrix3<f64>) -> Matrix3<f32> {
+    let largest = information.symmetric_eigenvalues().max();
+    if !(largest > 0.0) {
+        return Matrix3::zeros();
+    }
+    let regularized = information + Matrix3::identity() * (largest * 1e-4);
+    regularized.try_inverse().unwrap_or_else(Matrix3::zeros).cast()
 }
 
 /// Share of the true neighbours' distances that were found.
