@@ -225,6 +225,17 @@ impl SceneIndex {
         self.covariances[point.index()].cast()
     }
 
+    /// Angle that a position's uncertainty spans, per tangent axis, for a camera beside the first that observes it.
+    ///
+    /// In radians; 0 for points without observations.
+    pub fn angular_sigma(&self, point: PointId) -> f64 {
+        let center = self.rows_of(point).first().and_then(|&row| self.center(self.row(row).image));
+        let Some(offset) = center.map(|center| self.position(point) - center) else { return 0.0 };
+        let (covariance, distance2) = (self.position_covariance(point), offset.norm_squared());
+        let lateral = (covariance.trace() - offset.dot(&(covariance * offset)) / distance2) / 2.0;
+        if distance2 > 0.0 { (lateral.max(0.0) / distance2).sqrt() } else { 0.0 }
+    }
+
     /// Camera centre of a scene image in the scene's frame, when it is part of the model.
     pub fn center(&self, image: ImageId) -> Option<Vector3<f64>> {
         self.centers.get(image.index()).copied().flatten()

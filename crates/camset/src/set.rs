@@ -1,0 +1,152 @@
+//! The image set as one generalized camera, then as photos tied together by their local points.
+
+mod correspondences;
+mod joint;
+mod rigid;
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+use setloc_index::NearestPoints;
+use setloc_sfm::Reconstruction;
+
+use crate::advice::widest_paths;
+use crate::single::{SinglePose, locate_with_nearest};
+use crate::{CamsetParams, PhotoLocalization, QueryPhoto, Scene, SetLocalization, Verdict};
+
+use joint::{Component, ComponentAnswer};
+
+/// What is known of every photo before any local model is looked at.
+pub(crate) struct PhotoEvidence {
+    /// The scene points nearest to each feature.
+    nearest: Vec<NearestPoints>,
+    /// The photo alone.
+    alone: PhotoLocalization,
+    alone_pose: Option<SinglePose>,
+}
+
+/// Localizes a set through its local models (components of the photos' own reconstruction, largest first).
+///
+/// Image ids of `local_models` are indices into `photos`; models with fewer than two registered photos are left out.
+/// Every photo gets an answer: from the first model that localizes it, else alone. (L. Deng et al., "Image set
+/// querying based localization", VCIP 2015.)
+pub fn locate_set(
+    params: &CamsetParams,
+    scene: &Scene<'_>,
+    photos: &[QueryPhoto<'_>],
+    local_models: &[Reconstruction],
+    seed: u64,
+) -> SetLocalization {
+    let evidence: Vec<PhotoEvidence> = photos
+        .par_iter()
+        .enumerate()
+        .map(|(number, photo)| {
+            let nearest = scene.index.nearest_points(&photo.features.descriptors);
+            let seed = seed.wrapping_add(number as u64);
+            let (alone, alone_pose) = locate_with_nearest(&params.single, scene, photo, &nearest, seed);
+            PhotoEvidence { nearest, alone, alone_pose }
+        })
+        .collect();
+    let mut answer = SetLocalization::default();
+    let mut rigid: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
+    let mut refined: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
+    let mut scene_links: Vec<usize> =
+        evidence.iter().map(|e| if e.alone.world_from_camera.is_some() { e.alone.inliers } else { 0 }).collect();
+    let mut photo_links: BTreeMap<(usize, usize), usize> = BTreeMap::new();
+    for (number, model) in local_models.iter().enumerate() {
+        let members: Vec<usize> =
+            model.registered().map(|id| id.index()).filter(|&photo| photo < photos.len()).collect();
+        if members.len() < 2 {
+            continue;
+        }
+        for (pair, shared) in shared_points(model) {
+            *photo_links.entry(pair).or_default() += shared;
+        }
+        let seed = seed.wrapping_add(0x1000 * (number as u64 + 1));
+        let component = Component { params, scene, photos, evidence: &evidence, model, members: &members };
+        match component.locate(seed) {
+            ComponentAnswer::Localized(found) => {
+                answer.world_from_set.push(found.world_from_set);
+                for (slot, &photo) in members.iter().enumerate() {
+                    scene_links[photo] = scene_links[photo].max(found.scene_points[slot]);
+                    keep_better(&mut rigid[photo], found.rigid[slot].clone());
+                    keep_better(&mut refined[photo], found.refined[slot].clone());
+                }
+                answer.advice.extend(found.remarks);
+            }
+            ComponentAnswer::Refused { reasons, scene_points } => {
+                for (slot, &photo) in members.iter().enumerate() {
+                    scene_links[photo] = scene_links[photo].max(scene_points[slot]);
+                }
+                let names: Vec<&str> = members.iter().map(|&photo| photos[photo].name).collect();
+                answer.advice.push(format!("the local model of {} is not localized: {}", names.join(", "), reasons.join("; ")));
+            }
+        }
+    }
+    let names: Vec<&str> = photos.iter().map(|photo| photo.name).collect();
+    answer.paths = widest_paths(&names, &scene_links, &photo_links);
+    answer.rigid = or_alone(rigid, &evidence);
+    answer.refined = or_alone(refined, &evidence);
+    for (photo, path) in answer.refined.iter_mut().zip(&answer.paths) {
+        if photo.verdict == Verdict::NotLocalized {
+            answer.advice.push(path.advice());
+            continue;
+        }
+        if let Some(link) = path.weakest().filter(|link| link.from.is_some() && link.shared < params.verdict.min_link) {
+            photo.verdict = Verdict::Uncertain;
+            photo.reasons.push(format!("its weakest link to the scene shares {} points only", link.shared));
+        }
+        if photo.verdict == Verdict::Uncertain {
+            answer.advice.push(path.advice());
+        }
+    }
+    answer
+}
+
+/// Number of local points that each pair of photos shares, by image ids in ascending order.
+fn shared_points(model: &Reconstruction) -> BTreeMap<(usize, usize), usize> {
+    let mut shared = BTreeMap::new();
+    for point in &model.points {
+        let mut photos: Vec<usize> = point.track.iter().map(|o| o.image.index()).collect();
+        photos.sort_unstable();
+        photos.dedup();
+        for (i, &first) in photos.iter().enumerate() {
+            for &second in &photos[i + 1..] {
+                *shared.entry((first, second)).or_default() += 1;
+            }
+        }
+    }
+    shared
+}
+
+fn rank(verdict: Verdict) -> u8 {
+    match verdict {
+        Verdict::Localized => 2,
+        Verdict::Uncertain => 1,
+        Verdict::NotLocalized => 0,
+    }
+}
+
+fn keep_better(kept: &mut Option<PhotoLocalization>, other: PhotoLocalization) {
+    if kept.as_ref().is_none_or(|kept| rank(other.verdict) > rank(kept.verdict)) {
+        *kept = Some(other);
+    }
+}
+
+/// Answers of the set, and where it has none, those of the photos alone.
+fn or_alone(answers: Vec<Option<PhotoLocalization>>, evidence: &[PhotoEvidence]) -> Vec<PhotoLocalization> {
+    answers
+        .into_iter()
+        .zip(evidence)
+        .map(|(answer, evidence)| {
+            let mut best = answer;
+            let mut alone = evidence.alone.clone();
+            alone.reasons.insert(0, "localized alone: no local model of the set leads to it".to_owned());
+            if alone.verdict == Verdict::NotLocalized {
+                alone.reasons[0] = "neither its local model nor the photo alone is localized".to_owned();
+            }
+            keep_better(&mut best, alone.clone());
+            best.unwrap_or(alone)
+        })
+        .collect()
+}
