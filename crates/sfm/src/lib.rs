@@ -10,6 +10,7 @@ mod mapper;
 mod reconstruction;
 pub mod robust;
 pub mod solvers;
+pub mod synthetic;
 mod two_view;
 
 pub use geometry::{Rigid, Similarity};

@@ -1,1 +1,33 @@
 //! Robust estimators: LO-RANSAC over the minimal solvers, scored on the sphere.
+//!
+//! Every estimator counts whitened squared angular residuals, truncated at [`RansacParams::max_error_sigma`], so that
+//! rays of different cameras and accuracies mix. A ray supports a model only with positive depth. The same seed gives
+//! the same bytes.
+
+mod absolute_pose;
+mod least_squares;
+mod ransac;
+mod relative_pose;
+mod residual;
+
+pub use absolute_pose::{AbsolutePoseEstimate, estimate_absolute_pose, refine_absolute_pose};
+pub use ransac::{InvalidParams, RansacParams};
+pub use relative_pose::{
+    RelativePoseEstimate, RotationEstimate, estimate_relative_pose, estimate_rotation, refine_relative_pose,
+};
+pub use residual::AngularResidual;
+
+use nalgebra::Vector3;
+
+/// A ray of a camera set.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GeneralizedRay {
+    /// Centre of its camera in the set frame.
+    pub origin: Vector3<f64>,
+    /// Unit direction in the set frame.
+    pub direction: Vector3<f64>,
+    /// Standard deviation of the direction per tangent axis, in radians.
+    pub sigma: f64,
+    /// Which camera of the set it belongs to; rays of one camera share their origin.
+    pub camera: u32,
+}

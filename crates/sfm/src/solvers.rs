@@ -1,1 +1,33 @@
 //! Minimal and linear solvers, one per file: algebra only, no sampling and no scoring.
+//!
+//! All rays are unit vectors on the full sphere. A point lies on a ray only with a positive depth λ, wherever the
+//! ray points: there is no image plane and no "in front of the camera" other than the sign of λ.
+
+mod five_point;
+mod p3p;
+mod polynomial;
+mod solutions;
+
+pub mod essential;
+pub mod triangulation;
+
+pub use five_point::five_point;
+pub use p3p::p3p;
+pub use polynomial::real_roots;
+pub use solutions::Solutions;
+
+use nalgebra::Vector3;
+
+/// Two unit vectors that complete a unit vector to an orthonormal basis.
+///
+/// T. Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 2017: no branch, no singular direction.
+#[inline]
+pub fn tangent_basis(direction: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
+    let sign = 1.0_f64.copysign(direction.z);
+    let a = -1.0 / (sign + direction.z);
+    let b = direction.x * direction.y * a;
+    (
+        Vector3::new(1.0 + sign * direction.x * direction.x * a, sign * b, -sign * direction.x),
+        Vector3::new(b, sign + direction.y * direction.y * a, -direction.y),
+    )
+}
