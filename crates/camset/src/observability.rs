@@ -41,6 +41,11 @@ pub(crate) struct Observability {
 /// A standard deviation (radians, share of the distance, log-scale) from which a direction counts as undetermined.
 const UNDETERMINED: f64 = 0.2;
 
+/// Eigenvalues below this share of the largest are rounding errors of zero.
+const NULL_EIGENVALUE: f64 = 1e-13;
+/// A degree of freedom with more than this share (squared) of its direction in the null space is undetermined.
+const NULL_SHARE: f64 = 1e-4;
+
 impl Observability {
     /// Names of the undetermined directions.
     pub(crate) fn undetermined(&self) -> Vec<&'static str> {
@@ -143,13 +148,26 @@ pub(crate) fn observability(world_from_set: &Similarity, rays: &[SetRay]) -> Obs
     scaling.fixed_rows_mut::<3>(3).fill(depth);
     let scaled = Matrix7::from_diagonal(&scaling) * hessian * Matrix7::from_diagonal(&scaling);
     let eigen = scaled.symmetric_eigen();
-    let floor = eigen.eigenvalues.max().max(0.0) * 1e-13;
-    let inverse = eigen.eigenvalues.map(|value| if value > floor { 1.0 / value } else { f64::MAX.sqrt() });
-    let covariance = eigen.eigenvectors * Matrix7::from_diagonal(&inverse) * eigen.eigenvectors.transpose();
-    let worst = |start: usize| {
-        covariance.fixed_view::<3, 3>(start, start).into_owned().symmetric_eigenvalues().max().max(0.0).sqrt()
+    let floor = eigen.eigenvalues.max().max(0.0) * NULL_EIGENVALUE;
+    let mut covariance = Matrix7::zeros();
+    let mut in_null_space = Vector7::zeros();
+    for (value, vector) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
+        if *value > floor {
+            covariance += vector * vector.transpose() / *value;
+        } else {
+            in_null_space += vector.component_mul(&vector);
+        }
+    }
+    let sigma = |rows: std::ops::Range<usize>, variance: f64| {
+        let lost = rows.map(|row| in_null_space[row]).sum::<f64>() > NULL_SHARE;
+        if lost { f64::INFINITY } else { variance.max(0.0).sqrt() }
     };
-    Observability { rotation_rad: worst(0), position: worst(3), log_scale: covariance[(6, 6)].max(0.0).sqrt() }
+    let worst = |start: usize| covariance.fixed_view::<3, 3>(start, start).into_owned().symmetric_eigenvalues().max();
+    Observability {
+        rotation_rad: sigma(0..3, worst(0)),
+        position: sigma(3..6, worst(3)),
+        log_scale: sigma(6..7, covariance[(6, 6)]),
+    }
 }
 
 #[cfg(test)]

@@ -11,7 +11,7 @@ use setloc_index::NearestPoints;
 use setloc_sfm::Reconstruction;
 
 use crate::advice::widest_paths;
-use crate::single::{SinglePose, locate_with_nearest};
+use crate::single::locate_with_nearest;
 use crate::{CamsetParams, PhotoLocalization, QueryPhoto, Scene, SetLocalization, Verdict};
 
 use joint::{Component, ComponentAnswer};
@@ -22,7 +22,6 @@ pub(crate) struct PhotoEvidence {
     nearest: Vec<NearestPoints>,
     /// The photo alone.
     alone: PhotoLocalization,
-    alone_pose: Option<SinglePose>,
 }
 
 /// Localizes a set through its local models (components of the photos' own reconstruction, largest first).
@@ -43,8 +42,8 @@ pub fn locate_set(
         .map(|(number, photo)| {
             let nearest = scene.index.nearest_points(&photo.features.descriptors);
             let seed = seed.wrapping_add(number as u64);
-            let (alone, alone_pose) = locate_with_nearest(&params.single, scene, photo, &nearest, seed);
-            PhotoEvidence { nearest, alone, alone_pose }
+            let alone = locate_with_nearest(&params.single, scene, photo, &nearest, seed);
+            PhotoEvidence { nearest, alone }
         })
         .collect();
     let mut answer = SetLocalization::default();
@@ -149,4 +148,115 @@ fn or_alone(answers: Vec<Option<PhotoLocalization>>, evidence: &[PhotoEvidence])
             best.unwrap_or(alone)
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::CamsetMethod;
+    use crate::test_scene::{Place, World, along_street};
+
+    fn locate(world: &World, params: &CamsetParams) -> SetLocalization {
+        locate_set(params, &world.scene(), &world.queries(), std::slice::from_ref(&world.local), 7)
+    }
+
+    fn worst_errors(world: &World, photos: &[PhotoLocalization]) -> (f64, f64) {
+        photos.iter().enumerate().fold((0.0, 0.0), |(center, rotation): (f64, f64), (i, photo)| {
+            let pose = photo.world_from_camera.expect("has a pose");
+            let (c, r) = world.errors(i, &pose);
+            (center.max(c), rotation.max(r))
+        })
+    }
+
+    #[test]
+    fn a_set_carries_a_target_that_shares_nothing_with_the_scene() {
+        let world = World::chain(9, 0.2, 1);
+        assert_eq!(world.shared_with_scene(8), 0);
+        let found = locate(&world, &CamsetParams::default());
+        assert!(found.refined.iter().all(|photo| photo.verdict == Verdict::Localized), "{:#?}", found.refined[8]);
+        let (center, rotation) = worst_errors(&world, &found.refined);
+        assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
+        let target = &found.paths[8];
+        assert!(target.links.len() > 2 && target.weakest().is_some_and(|link| link.shared >= 12));
+    }
+
+    #[test]
+    fn the_papers_method_localizes_the_same_set() {
+        let world = World::chain(9, 0.2, 2);
+        let found = locate(&world, &CamsetParams::paper());
+        let (center, rotation) = worst_errors(&world, &found.rigid);
+        assert!(center < 0.3 && rotation < 0.5, "{center} {rotation}");
+        assert_eq!(CamsetParams::paper().method, CamsetMethod::Dlt);
+    }
+
+    #[test]
+    fn joint_refinement_undoes_the_drift_of_the_local_model() {
+        let mut world = World::chain(9, 0.2, 3);
+        world.bend(0.002, 0.002);
+        let found = locate(&world, &CamsetParams::default());
+        let (rigid, refined) = (worst_errors(&world, &found.rigid), worst_errors(&world, &found.refined));
+        assert!(refined.0 < 0.4 * rigid.0 && refined.1 < 0.4 * rigid.1, "{rigid:?} {refined:?}");
+        assert!(refined.0 < 0.15 && refined.1 < 0.2, "{refined:?}");
+    }
+
+    #[test]
+    fn a_set_from_one_centre_has_no_scale() {
+        let place = Place::street(3500, 4);
+        let center = Vector3::new(0.0, -1.5, 22.0);
+        let poses: Vec<_> = (0..4).map(|i| along_street(center, 0.1 * f64::from(i))).collect();
+        let world = World::new(place, &poses, 0.1, 4);
+        let found = locate(&world, &CamsetParams::default());
+        for (i, photo) in found.rigid.iter().enumerate() {
+            assert_ne!(photo.verdict, Verdict::Localized);
+            assert!(photo.reasons.iter().any(|reason| reason.contains("scale")), "{i}: {:?}", photo.reasons);
+        }
+    }
+
+    #[test]
+    fn foreign_photos_are_not_localized() {
+        let world = World::chain(5, 0.2, 5);
+        for seed in 0..10 {
+            let elsewhere = World::chain(5, 0.2, 100 + seed);
+            let found = locate_set(
+                &CamsetParams::default(),
+                &world.scene(),
+                &elsewhere.queries(),
+                std::slice::from_ref(&elsewhere.local),
+                seed,
+            );
+            for photo in found.rigid.iter().chain(&found.refined) {
+                assert_eq!(photo.verdict, Verdict::NotLocalized, "{seed}: {photo:#?}");
+            }
+            assert!(found.advice.iter().any(|sentence| sentence.contains("take")), "{:?}", found.advice);
+        }
+    }
+
+    #[test]
+    fn two_equal_places_leave_a_set_uncertain() {
+        let place = Place::street(3500, 6);
+        let poses: Vec<_> =
+            (0..4).map(|i| along_street(Vector3::new(0.0, -1.5, 18.0 + 3.0 * f64::from(i)), 0.0)).collect();
+        let mut world = World::new(place, &poses, 0.1, 6);
+        world.split_scene(Vector3::new(300.0, 0.0, 0.0));
+        let found = locate(&world, &CamsetParams::default());
+        for photo in &found.refined {
+            assert_ne!(photo.verdict, Verdict::Localized, "{photo:#?}");
+        }
+    }
+
+    #[test]
+    fn a_set_without_local_model_is_localized_photo_by_photo() {
+        let world = World::chain(3, 0.2, 8);
+        let found = locate_set(&CamsetParams::default(), &world.scene(), &world.queries(), &[], 1);
+        assert!(found.world_from_set.is_empty());
+        assert!(found.refined.iter().all(|photo| photo.verdict == Verdict::Localized), "{:#?}", found.refined);
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_answer() {
+        let world = World::chain(5, 0.3, 9);
+        assert_eq!(locate(&world, &CamsetParams::default()), locate(&world, &CamsetParams::default()));
+    }
 }

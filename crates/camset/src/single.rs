@@ -20,15 +20,15 @@ const SAMPLE: usize = 3;
 const FOCAL_FACTORS: [f64; 7] = [1.0, 0.84, 1.19, 0.71, 1.41, 0.56, 1.78];
 
 /// A pose of one photo with everything that speaks for it.
-pub(crate) struct SinglePose {
-    pub camera: Camera,
-    pub world_from_camera: Rigid,
-    pub covariance: Option<Matrix6<f64>>,
+struct SinglePose {
+    camera: Camera,
+    world_from_camera: Rigid,
+    covariance: Option<Matrix6<f64>>,
     /// Inliers after guided matching.
-    pub inliers: Vec<SceneMatch>,
+    inliers: Vec<SceneMatch>,
     /// Median distance to the inliers' scene points.
-    pub depth: f64,
-    pub evidence: Evidence,
+    depth: f64,
+    evidence: Evidence,
 }
 
 /// Localizes one photo alone.
@@ -38,7 +38,7 @@ pub(crate) struct SinglePose {
 /// (T. Sattler, B. Leibe, L. Kobbelt, "Fast image-based localization using direct 2D-to-3D matching", ICCV 2011.)
 pub fn locate_single(params: &SingleParams, scene: &Scene<'_>, photo: &QueryPhoto<'_>, seed: u64) -> PhotoLocalization {
     let nearest = scene.index.nearest_points(&photo.features.descriptors);
-    locate_with_nearest(params, scene, photo, &nearest, seed).0
+    locate_with_nearest(params, scene, photo, &nearest, seed)
 }
 
 /// [`locate_single`] where the nearest scene points of all features are already known.
@@ -48,7 +48,7 @@ pub(crate) fn locate_with_nearest(
     photo: &QueryPhoto<'_>,
     nearest: &[NearestPoints],
     seed: u64,
-) -> (PhotoLocalization, Option<SinglePose>) {
+) -> PhotoLocalization {
     let matches: Vec<SceneMatch> = scene
         .index
         .correspondences(nearest, params.ratio)
@@ -57,30 +57,29 @@ pub(crate) fn locate_with_nearest(
         .collect();
     if matches.len() < params.verdict.min_inliers {
         let reason = format!("{} of its features resemble a scene point, at least {} must", matches.len(), params.verdict.min_inliers);
-        return (PhotoLocalization::not_localized(photo, reason), None);
+        return PhotoLocalization::not_localized(photo, reason);
     }
     let Some(found) = solve(params, scene, photo, nearest, &matches, seed) else {
         let reason = format!("no pose explains any of its {} matches to the scene", matches.len());
-        return (PhotoLocalization::not_localized(photo, reason), None);
+        return PhotoLocalization::not_localized(photo, reason);
     };
     let mut reasons = Vec::new();
     let mut verdict = judge_support(&params.verdict, &found.evidence, &mut reasons);
     if verdict == Verdict::NotLocalized {
         let mut refused = PhotoLocalization::not_localized(photo, String::new());
         (refused.reasons, refused.inliers) = (reasons, found.evidence.inliers);
-        return (refused, None);
+        return refused;
     }
     verdict = weaker(verdict, judge_precision(&params.verdict, found.covariance.as_ref(), found.depth, &mut reasons));
-    let answer = PhotoLocalization {
+    PhotoLocalization {
         name: photo.name.to_owned(),
-        camera: found.camera.clone(),
+        camera: found.camera,
         world_from_camera: Some(found.world_from_camera),
         covariance: found.covariance,
         inliers: found.inliers.len(),
         verdict,
         reasons,
-    };
-    (answer, Some(found))
+    }
 }
 
 struct Hypothesis {
@@ -271,4 +270,72 @@ fn with_focal_factor(camera: &Camera, factor: f64) -> Camera {
     };
     scaled.params.iter_mut().take(focal_lengths).for_each(|focal| *focal *= factor);
     scaled
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::test_scene::World;
+
+    fn locate(world: &World, photo: usize) -> PhotoLocalization {
+        locate_single(&SingleParams::default(), &world.scene(), &world.queries()[photo], 3)
+    }
+
+    #[test]
+    fn a_photo_beside_the_panoramas_is_localized_and_one_far_away_is_refused() {
+        let world = World::chain(9, 0.3, 1);
+        let near = locate(&world, 0);
+        assert_eq!(near.verdict, Verdict::Localized, "{near:#?}");
+        let (center, rotation) = world.errors(0, &near.world_from_camera.unwrap());
+        assert!(center < 0.03 && rotation < 0.1, "{center} {rotation}");
+        assert!(near.inliers > 100);
+        let far = locate(&world, 8);
+        assert_eq!(far.verdict, Verdict::NotLocalized, "{far:#?}");
+        assert!(far.world_from_camera.is_none() && !far.reasons.is_empty());
+    }
+
+    #[test]
+    fn centre_errors_fit_the_covariance() {
+        let (mut squared, mut count) = (0.0, 0);
+        for seed in 20..30 {
+            let world = World::chain(4, 0.2, seed);
+            for photo in 0..2 {
+                let found = locate(&world, photo);
+                let (pose, covariance) = (found.world_from_camera.unwrap(), found.covariance.unwrap());
+                let error = pose.translation - world.photos[photo].pose.translation;
+                let information = covariance.fixed_view::<3, 3>(3, 3).into_owned().try_inverse().unwrap();
+                squared += error.dot(&(information * error)) / 3.0;
+                count += 1;
+            }
+        }
+        let mean = squared / f64::from(count);
+        assert!((0.4..1.8).contains(&mean), "{mean}");
+    }
+
+    #[test]
+    fn an_unknown_focal_length_is_found() {
+        let world = World::chain(2, 0.2, 11);
+        let mut guess = world.camera.clone();
+        guess.params[0] = 640.0;
+        guess.params[1] = 640.0;
+        let query = QueryPhoto { camera: &guess, camera_fixed: false, ..world.queries()[0] };
+        let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5);
+        assert!((found.camera.params[0] / 800.0 - 1.0).abs() < 0.01, "{:?}", found.camera.params);
+        let (center, rotation) = world.errors(0, &found.world_from_camera.unwrap());
+        assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
+    }
+
+    #[test]
+    fn foreign_and_empty_photos_are_refused() {
+        let world = World::chain(2, 0.2, 12);
+        for seed in 0..10 {
+            let elsewhere = World::chain(2, 0.2, 200 + seed);
+            let found = locate_single(&SingleParams::default(), &world.scene(), &elsewhere.queries()[0], seed);
+            assert_eq!(found.verdict, Verdict::NotLocalized);
+        }
+        let empty = setloc_features::ImageFeatures::default();
+        let query = QueryPhoto { features: &empty, ..world.queries()[0] };
+        let found = locate_single(&SingleParams::default(), &world.scene(), &query, 1);
+        assert_eq!(found.verdict, Verdict::NotLocalized);
+    }
 }

@@ -1,6 +1,8 @@
 //! The pose of the rigid camera set, and whether another pose would do as well.
 
-use setloc_sfm::robust::{GeneralizedOptions, GeneralizedRay, RansacParams, estimate_generalized_pose};
+use setloc_sfm::robust::{
+    GeneralizedPoseOptions, GeneralizedRay, GeneralizedSolver, RansacParams, estimate_generalized_pose,
+};
 use setloc_sfm::{Rigid, Similarity};
 
 use super::PhotoEvidence;
@@ -69,10 +71,11 @@ fn estimate(params: &CamsetParams, rays: &SetRays, seed: u64) -> Option<Similari
         .collect();
     let points: Vec<_> = rays.rays.iter().map(|ray| ray.point).collect();
     let ransac = RansacParams { max_error_sigma: params.max_error_sigmas, ..RansacParams::default() };
-    let options = match params.method {
-        CamsetMethod::Gp4ps => GeneralizedOptions::default(),
-        CamsetMethod::Dlt => GeneralizedOptions::default(),
+    let solver = match params.method {
+        CamsetMethod::Gp4ps => GeneralizedSolver::Minimal,
+        CamsetMethod::Dlt => GeneralizedSolver::Dlt,
     };
+    let options = GeneralizedPoseOptions { solver, ..GeneralizedPoseOptions::default() };
     estimate_generalized_pose(&ransac, &generalized, &points, &options, seed).map(|found| found.world_from_set)
 }
 
