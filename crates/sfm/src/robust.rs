@@ -5,12 +5,17 @@
 //! the same bytes.
 
 mod absolute_pose;
+mod generalized_pose;
 mod least_squares;
 mod ransac;
 mod relative_pose;
 mod residual;
 
 pub use absolute_pose::{AbsolutePoseEstimate, estimate_absolute_pose, refine_absolute_pose};
+pub use generalized_pose::{
+    GeneralizedPoseEstimate, GeneralizedPoseOptions, GeneralizedSolver, Gravity, SetScale, estimate_generalized_pose,
+    refine_generalized_pose,
+};
 pub use ransac::{InvalidParams, RansacParams};
 pub use relative_pose::{
     RelativePoseEstimate, RotationEstimate, estimate_relative_pose, estimate_rotation, refine_relative_pose,

@@ -3,18 +3,28 @@
 //! All rays are unit vectors on the full sphere. A point lies on a ray only with a positive depth λ, wherever the
 //! ray points: there is no image plane and no "in front of the camera" other than the sign of λ.
 
+mod dlt;
 mod five_point;
+mod gp3p;
+mod gp4ps;
 mod p3p;
 mod polynomial;
+mod quadrics;
+mod rotation_quadric;
 mod solutions;
+mod ugp3ps;
 
 pub mod essential;
 pub mod triangulation;
 
+pub use dlt::dlt;
 pub use five_point::five_point;
+pub use gp3p::gp3p;
+pub use gp4ps::gp4ps;
 pub use p3p::p3p;
 pub use polynomial::real_roots;
 pub use solutions::Solutions;
+pub use ugp3ps::ugp3ps;
 
 use nalgebra::Vector3;
 

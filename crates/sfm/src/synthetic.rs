@@ -204,3 +204,10 @@ impl GeneralizedProblem {
         )
     }
 }
+
+/// Whether two similarities agree: angle and logarithmic scale below `tolerance`, translation relative to its length.
+pub fn same_similarity(a: &Similarity, b: &Similarity, tolerance: f64) -> bool {
+    rotation_angle(&a.rotation, &b.rotation) < tolerance
+        && (a.scale / b.scale).ln().abs() < tolerance
+        && (a.translation - b.translation).norm() < tolerance * (1.0 + b.translation.norm())
+}
