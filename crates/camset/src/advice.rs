@@ -97,7 +97,11 @@ pub(crate) fn widest_paths(
             let mut at = Some(photo);
             while let Some(here) = at {
                 let Some((shared, from)) = parent[here] else { break };
-                links.push(Link { from: from.map(|f| names[f].to_owned()), to: names[here].to_owned(), shared });
+                links.push(Link {
+                    from: from.map(|f| names[f].to_owned()),
+                    to: names[here].to_owned(),
+                    shared,
+                });
                 at = from;
             }
             links.reverse();

@@ -27,7 +27,12 @@ impl<'a> PhotoRays<'a> {
     /// Error of a match under a pose, in standard deviations of the ray and of the scene point together.
     ///
     /// Infinite when the ray cannot be used or points away from the point.
-    pub(crate) fn error_sigmas(&self, index: &SceneIndex, world_from_camera: &Rigid, found: SceneMatch) -> f64 {
+    pub(crate) fn error_sigmas(
+        &self,
+        index: &SceneIndex,
+        world_from_camera: &Rigid,
+        found: SceneMatch,
+    ) -> f64 {
         let feature = found.feature as usize;
         let (bearing, sigma) = (self.rays.bearings[feature], self.rays.sigmas[feature]);
         if !sigma.is_finite() {
@@ -39,7 +44,12 @@ impl<'a> PhotoRays<'a> {
     }
 
     /// Standard deviation of a match in pixels: of the keypoint and of the scene point together.
-    pub(crate) fn match_noise_px(&self, index: &SceneIndex, world_from_camera: &Rigid, found: SceneMatch) -> f64 {
+    pub(crate) fn match_noise_px(
+        &self,
+        index: &SceneIndex,
+        world_from_camera: &Rigid,
+        found: SceneMatch,
+    ) -> f64 {
         let keypoint = &self.features.keypoints[found.feature as usize];
         let own = f64::from(keypoint.noise_px);
         let offset = index.position(found.point) - world_from_camera.translation;
@@ -72,9 +82,11 @@ fn ray_error_sigmas(
     let sine = residual.norm();
     let angle = sine.atan2(bearing.dot(&direction));
     let residual = if sine > 0.0 { residual * (angle / sine) } else { residual };
-    let covariance =
-        basis * point_covariance * basis.transpose() / (distance * distance) + Matrix2::identity() * (sigma * sigma);
-    covariance.try_inverse().map_or(f64::INFINITY, |information| residual.dot(&(information * residual)).max(0.0).sqrt())
+    let covariance = basis * point_covariance * basis.transpose() / (distance * distance)
+        + Matrix2::identity() * (sigma * sigma);
+    covariance
+        .try_inverse()
+        .map_or(f64::INFINITY, |information| residual.dot(&(information * residual)).max(0.0).sqrt())
 }
 
 /// Two orthonormal rows that span the tangent plane of the sphere at a direction.
@@ -109,7 +121,8 @@ pub(crate) fn chance_of_inlier(
     matches: &[SceneMatch],
     max_error_sigmas: f64,
 ) -> f64 {
-    let occupied = cells(photo, 0..photo.features.len() as u32, 16).into_iter().filter(|&occupied| occupied).count();
+    let occupied =
+        cells(photo, 0..photo.features.len() as u32, 16).into_iter().filter(|&occupied| occupied).count();
     let area = f64::from(photo.camera.width) * f64::from(photo.camera.height) * occupied as f64 / 256.0;
     if matches.is_empty() || !(area > 0.0) {
         return 1.0;

@@ -25,7 +25,8 @@ pub(crate) fn guided_matches(
     let usable: Vec<u32> =
         (0..photo.features.len() as u32).filter(|&i| photo.rays.sigmas[i as usize].is_finite()).collect();
     let bearings: Vec<[f64; 3]> = usable.iter().map(|&i| photo.rays.bearings[i as usize].into()).collect();
-    let Some(tree) = (!bearings.is_empty()).then(|| ImmutableKdTree::<f64, 3>::new_from_slice(&bearings).ok()).flatten()
+    let Some(tree) =
+        (!bearings.is_empty()).then(|| ImmutableKdTree::<f64, 3>::new_from_slice(&bearings).ok()).flatten()
     else {
         return Vec::new();
     };
@@ -37,7 +38,9 @@ pub(crate) fn guided_matches(
         let offset = index.position(point) - world_from_camera.translation;
         let distance = offset.norm();
         let direction_in_camera = world_from_camera.rotation.inverse_transform_vector(&offset);
-        let Some(pixel) = photo.camera.project(&direction_in_camera).filter(|pixel| inside(photo.camera, pixel)) else {
+        let Some(pixel) =
+            photo.camera.project(&direction_in_camera).filter(|pixel| inside(photo.camera, pixel))
+        else {
             continue;
         };
         let Some(angle) = photo.camera.pixel_angle(&pixel).filter(|angle| *angle > 0.0) else { continue };
@@ -98,5 +101,8 @@ pub(crate) fn guided_matches(
 }
 
 fn inside(camera: &Camera, pixel: &Vector2<f64>) -> bool {
-    pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < f64::from(camera.width) && pixel.y < f64::from(camera.height)
+    pixel.x >= 0.0
+        && pixel.y >= 0.0
+        && pixel.x < f64::from(camera.width)
+        && pixel.y < f64::from(camera.height)
 }

@@ -61,7 +61,11 @@ impl Observability {
 ///
 /// d = set_from_world · X − origin; the perturbation acts on the left of `set_from_world`, about `pivot`:
 /// δd = ω × (X' − pivot) + v + λ (X' − pivot), in the order ω, v, λ.
-fn normal_equations(set_from_world: &Similarity, rays: &[SetRay], pivot: &Vector3<f64>) -> (Matrix7, Vector7) {
+fn normal_equations(
+    set_from_world: &Similarity,
+    rays: &[SetRay],
+    pivot: &Vector3<f64>,
+) -> (Matrix7, Vector7) {
     let (mut hessian, mut gradient) = (Matrix7::zeros(), Vector7::zeros());
     for ray in rays {
         let point_in_set = set_from_world.transform_point(&ray.point);
@@ -76,7 +80,8 @@ fn normal_equations(set_from_world: &Similarity, rays: &[SetRay], pivot: &Vector
         jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(&-arm.cross_matrix());
         jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&nalgebra::Matrix3::identity());
         jacobian.fixed_view_mut::<3, 1>(0, 6).copy_from(&arm);
-        let projector = (nalgebra::Matrix3::identity() - direction * direction.transpose()) / (distance * ray.sigma);
+        let projector =
+            (nalgebra::Matrix3::identity() - direction * direction.transpose()) / (distance * ray.sigma);
         let jacobian = projector * jacobian;
         let residual = (direction - ray.direction) / ray.sigma;
         hessian += jacobian.transpose() * jacobian;
@@ -109,7 +114,8 @@ pub(crate) fn refine_similarity(world_from_set: &Similarity, rays: &[SetRay], tr
     let mut damping = 1e-4;
     let mut current = cost(&pose, rays, truncation);
     for _ in 0..30 {
-        let inliers: Vec<SetRay> = rays.iter().copied().filter(|r| r.error_sigmas(&pose) < truncation).collect();
+        let inliers: Vec<SetRay> =
+            rays.iter().copied().filter(|r| r.error_sigmas(&pose) < truncation).collect();
         if inliers.len() < 4 {
             break;
         }
@@ -141,8 +147,9 @@ pub(crate) fn observability(world_from_set: &Similarity, rays: &[SetRay]) -> Obs
     let set_from_world = world_from_set.inverse();
     let pivot = mean_origin(rays);
     let (hessian, _) = normal_equations(&set_from_world, rays, &pivot);
-    let depth = rays.iter().map(|r| (set_from_world.transform_point(&r.point) - r.origin).norm()).sum::<f64>()
-        / rays.len().max(1) as f64;
+    let depth =
+        rays.iter().map(|r| (set_from_world.transform_point(&r.point) - r.origin).norm()).sum::<f64>()
+            / rays.len().max(1) as f64;
     // Lengths in units of the depth make all seven directions comparable.
     let mut scaling = Vector7::repeat(1.0);
     scaling.fixed_rows_mut::<3>(3).fill(depth);
@@ -162,7 +169,8 @@ pub(crate) fn observability(world_from_set: &Similarity, rays: &[SetRay]) -> Obs
         let lost = rows.map(|row| in_null_space[row]).sum::<f64>() > NULL_SHARE;
         if lost { f64::INFINITY } else { variance.max(0.0).sqrt() }
     };
-    let worst = |start: usize| covariance.fixed_view::<3, 3>(start, start).into_owned().symmetric_eigenvalues().max();
+    let worst =
+        |start: usize| covariance.fixed_view::<3, 3>(start, start).into_owned().symmetric_eigenvalues().max();
     Observability {
         rotation_rad: sigma(0..3, worst(0)),
         position: sigma(3..6, worst(3)),
@@ -202,11 +210,12 @@ mod tests {
         for ray in rays.iter_mut().take(6) {
             ray.direction = -ray.direction;
         }
-        let start = truth() * Similarity {
-            scale: 1.02,
-            rotation: UnitQuaternion::from_scaled_axis(Vector3::new(0.01, -0.01, 0.01)),
-            translation: Vector3::new(0.03, 0.02, -0.03),
-        };
+        let start = truth()
+            * Similarity {
+                scale: 1.02,
+                rotation: UnitQuaternion::from_scaled_axis(Vector3::new(0.01, -0.01, 0.01)),
+                translation: Vector3::new(0.03, 0.02, -0.03),
+            };
         let found = refine_similarity(&start, &rays, 60.0);
         assert!(found.rotation.angle_to(&truth().rotation) < 1e-9);
         assert!((found.translation - truth().translation).norm() < 1e-8);
@@ -241,7 +250,8 @@ mod tests {
         for i in 0..7 {
             let mut step = Vector7::zeros();
             step[i] = 1e-6;
-            let numeric = (value(&perturb(&start, &step, &pivot)) - value(&perturb(&start, &-step, &pivot))) / 2e-6;
+            let numeric =
+                (value(&perturb(&start, &step, &pivot)) - value(&perturb(&start, &-step, &pivot))) / 2e-6;
             assert!((numeric - gradient[i]).abs() < 1e-4 * gradient.norm(), "{i}: {numeric} {}", gradient[i]);
         }
     }

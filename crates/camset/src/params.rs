@@ -141,6 +141,12 @@ impl Default for CamsetParams {
 impl CamsetParams {
     /// The paper's settings: DLT, both ratios 0.6, no lone rays.
     pub fn paper() -> Self {
-        Self { method: CamsetMethod::Dlt, ratio: 0.6, reverse_ratio: 0.6, lone_rays: false, ..Self::default() }
+        Self {
+            method: CamsetMethod::Dlt,
+            ratio: 0.6,
+            reverse_ratio: 0.6,
+            lone_rays: false,
+            ..Self::default()
+        }
     }
 }

@@ -6,7 +6,8 @@ use nalgebra::{Matrix6, Vector3};
 use setloc_features::Camera;
 use setloc_index::SceneIndex;
 use setloc_sfm::bundle::{
-    self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom, RobustLoss,
+    self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
+    RobustLoss,
 };
 use setloc_sfm::{PointId, Rigid};
 
@@ -93,7 +94,11 @@ pub(crate) fn refine_jointly(
         .iter()
         .zip(&model.camera_fixed)
         .map(|(&support, &fixed)| {
-            if fixed || support < MIN_FOR_INTRINSICS { IntrinsicsFreedom::FIXED } else { IntrinsicsFreedom::LENS }
+            if fixed || support < MIN_FOR_INTRINSICS {
+                IntrinsicsFreedom::FIXED
+            } else {
+                IntrinsicsFreedom::LENS
+            }
         })
         .collect();
     let poses = model
@@ -126,6 +131,34 @@ pub(crate) fn refine_jointly(
     if !with_covariance {
         return vec![None; model.photos.len()];
     }
-    let wanted: Vec<u32> = (0..problem.poses.len() as u32).collect();
-    bundle::covariance(&problem, &wanted)
+    covariances(&problem, params.loss)
+}
+
+/// Covariances of all poses; where the whole is undetermined, of those that their fixed points determine alone.
+fn covariances(problem: &BundleProblem, loss: RobustLoss) -> Vec<Option<Matrix6<f64>>> {
+    let wanted: Vec<u32> =
+        (0..problem.poses.len() as u32).filter(|&pose| !problem.poses[pose as usize].fixed).collect();
+    let mut found = vec![None; problem.poses.len()];
+    if let Some(covariances) = bundle::covariance(problem, loss, &wanted) {
+        for (&pose, covariance) in wanted.iter().zip(covariances) {
+            found[pose as usize] = Some(covariance);
+        }
+        return found;
+    }
+    for &pose in &wanted {
+        let ties = |o: &&BundleObservation| o.pose == pose && problem.points[o.point as usize].fixed;
+        let observations: Vec<BundleObservation> =
+            problem.observations.iter().filter(ties).map(|o| BundleObservation { pose: 0, ..*o }).collect();
+        let alone = BundleProblem {
+            cameras: problem.cameras.clone(),
+            camera_freedom: problem.camera_freedom.clone(),
+            poses: vec![problem.poses[pose as usize]],
+            points: problem.points.clone(),
+            observations,
+            position_priors: Vec::new(),
+        };
+        let covariance = bundle::covariance(&alone, loss, &[0]);
+        found[pose as usize] = covariance.and_then(|covariances| covariances.first().copied());
+    }
+    found
 }

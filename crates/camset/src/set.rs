@@ -49,8 +49,10 @@ pub fn locate_set(
     let mut answer = SetLocalization::default();
     let mut rigid: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut refined: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
-    let mut scene_links: Vec<usize> =
-        evidence.iter().map(|e| if e.alone.world_from_camera.is_some() { e.alone.inliers } else { 0 }).collect();
+    let mut scene_links: Vec<usize> = evidence
+        .iter()
+        .map(|e| if e.alone.world_from_camera.is_some() { e.alone.inliers } else { 0 })
+        .collect();
     let mut photo_links: BTreeMap<(usize, usize), usize> = BTreeMap::new();
     for (number, model) in local_models.iter().enumerate() {
         let members: Vec<usize> =
@@ -78,7 +80,11 @@ pub fn locate_set(
                     scene_links[photo] = scene_links[photo].max(scene_points[slot]);
                 }
                 let names: Vec<&str> = members.iter().map(|&photo| photos[photo].name).collect();
-                answer.advice.push(format!("the local model of {} is not localized: {}", names.join(", "), reasons.join("; ")));
+                answer.advice.push(format!(
+                    "the local model of {} is not localized: {}",
+                    names.join(", "),
+                    reasons.join("; ")
+                ));
             }
         }
     }
@@ -91,7 +97,9 @@ pub fn locate_set(
             answer.advice.push(path.advice());
             continue;
         }
-        if let Some(link) = path.weakest().filter(|link| link.from.is_some() && link.shared < params.verdict.min_link) {
+        if let Some(link) =
+            path.weakest().filter(|link| link.from.is_some() && link.shared < params.verdict.min_link)
+        {
             photo.verdict = Verdict::Uncertain;
             photo.reasons.push(format!("its weakest link to the scene shares {} points only", link.shared));
         }
@@ -175,7 +183,11 @@ mod tests {
         let world = World::chain(9, 0.2, 1);
         assert_eq!(world.shared_with_scene(8), 0);
         let found = locate(&world, &CamsetParams::default());
-        assert!(found.refined.iter().all(|photo| photo.verdict == Verdict::Localized), "{:#?}", found.refined[8]);
+        assert!(
+            found.refined.iter().all(|photo| photo.verdict == Verdict::Localized),
+            "{:#?}",
+            found.refined[8]
+        );
         let (center, rotation) = worst_errors(&world, &found.refined);
         assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
         let target = &found.paths[8];
@@ -251,7 +263,11 @@ mod tests {
         let world = World::chain(3, 0.2, 8);
         let found = locate_set(&CamsetParams::default(), &world.scene(), &world.queries(), &[], 1);
         assert!(found.world_from_set.is_empty());
-        assert!(found.refined.iter().all(|photo| photo.verdict == Verdict::Localized), "{:#?}", found.refined);
+        assert!(
+            found.refined.iter().all(|photo| photo.verdict == Verdict::Localized),
+            "{:#?}",
+            found.refined
+        );
     }
 
     #[test]

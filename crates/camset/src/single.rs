@@ -36,7 +36,12 @@ struct SinglePose {
 /// 2D-to-3D matches pass a ratio test, LO-RANSAC with P3P finds the pose, scene points are then searched for near
 /// their projections and the pose (with the intrinsics, when they are not known) is refined on all inliers.
 /// (T. Sattler, B. Leibe, L. Kobbelt, "Fast image-based localization using direct 2D-to-3D matching", ICCV 2011.)
-pub fn locate_single(params: &SingleParams, scene: &Scene<'_>, photo: &QueryPhoto<'_>, seed: u64) -> PhotoLocalization {
+pub fn locate_single(
+    params: &SingleParams,
+    scene: &Scene<'_>,
+    photo: &QueryPhoto<'_>,
+    seed: u64,
+) -> PhotoLocalization {
     let nearest = scene.index.nearest_points(&photo.features.descriptors);
     locate_with_nearest(params, scene, photo, &nearest, seed)
 }
@@ -56,7 +61,11 @@ pub(crate) fn locate_with_nearest(
         .map(|c| SceneMatch { feature: c.feature, point: c.point })
         .collect();
     if matches.len() < params.verdict.min_inliers {
-        let reason = format!("{} of its features resemble a scene point, at least {} must", matches.len(), params.verdict.min_inliers);
+        let reason = format!(
+            "{} of its features resemble a scene point, at least {} must",
+            matches.len(),
+            params.verdict.min_inliers
+        );
         return PhotoLocalization::not_localized(photo, reason);
     }
     let Some(found) = solve(params, scene, photo, nearest, &matches, seed) else {
@@ -70,7 +79,10 @@ pub(crate) fn locate_with_nearest(
         (refused.reasons, refused.inliers) = (reasons, found.evidence.inliers);
         return refused;
     }
-    verdict = weaker(verdict, judge_precision(&params.verdict, found.covariance.as_ref(), found.depth, &mut reasons));
+    verdict = weaker(
+        verdict,
+        judge_precision(&params.verdict, found.covariance.as_ref(), found.depth, &mut reasons),
+    );
     PhotoLocalization {
         name: photo.name.to_owned(),
         camera: found.camera,
@@ -107,7 +119,8 @@ fn solve(
     let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
     let agreeing = inliers(&rays, scene.index, &pose, matches, params.max_error_sigmas);
-    let depth = median(agreeing.iter().map(|m| (scene.index.position(m.point) - pose.translation).norm()).collect())?;
+    let depth =
+        median(agreeing.iter().map(|m| (scene.index.position(m.point) - pose.translation).norm()).collect())?;
     let rest: Vec<SceneMatch> = matches.iter().copied().filter(|m| !agreeing.contains(m)).collect();
     let runner_up = runner_up(params, scene.index, &rays, &rest, &pose, depth, seed);
     let chance = chance_of_inlier(&rays, scene.index, &pose, &agreeing, params.max_error_sigmas);
@@ -120,7 +133,14 @@ fn solve(
         runner_up,
     };
     if agreeing.len() < params.verdict.min_inliers {
-        return Some(SinglePose { camera, world_from_camera: pose, covariance: None, inliers: agreeing, depth, evidence });
+        return Some(SinglePose {
+            camera,
+            world_from_camera: pose,
+            covariance: None,
+            inliers: agreeing,
+            depth,
+            evidence,
+        });
     }
     let guided = guided_matches(&params.guided, scene.index, &rays, nearest, &pose);
     let candidates = union(&agreeing, &guided);
@@ -224,8 +244,16 @@ fn estimate(
 }
 
 /// Σ 1 − min(1, (e/T)²) over the matches.
-fn score(params: &SingleParams, index: &SceneIndex, rays: &PhotoRays<'_>, pose: &Rigid, matches: &[SceneMatch]) -> f64 {
-    let gain = |&m: &SceneMatch| 1.0 - (rays.error_sigmas(index, pose, m) / params.max_error_sigmas).min(1.0).powi(2);
+fn score(
+    params: &SingleParams,
+    index: &SceneIndex,
+    rays: &PhotoRays<'_>,
+    pose: &Rigid,
+    matches: &[SceneMatch],
+) -> f64 {
+    let gain = |&m: &SceneMatch| {
+        1.0 - (rays.error_sigmas(index, pose, m) / params.max_error_sigmas).min(1.0).powi(2)
+    };
     matches.iter().map(gain).sum()
 }
 
@@ -240,7 +268,9 @@ fn runner_up(
     seed: u64,
 ) -> usize {
     match estimate(params, index, rays, rest, seed ^ 0x5eed) {
-        Some(pose) if !same_pose(&pose, best, depth) => inliers(rays, index, &pose, rest, params.max_error_sigmas).len(),
+        Some(pose) if !same_pose(&pose, best, depth) => {
+            inliers(rays, index, &pose, rest, params.max_error_sigmas).len()
+        }
         _ => 0,
     }
 }
@@ -253,7 +283,8 @@ fn covisible_subsets(index: &SceneIndex, matches: &[SceneMatch], count: usize) -
             by_image.entry(index.row(row).image).or_default().push(found);
         }
     }
-    let mut subsets: Vec<Vec<SceneMatch>> = by_image.into_values().filter(|subset| subset.len() > SAMPLE).collect();
+    let mut subsets: Vec<Vec<SceneMatch>> =
+        by_image.into_values().filter(|subset| subset.len() > SAMPLE).collect();
     subsets.iter_mut().for_each(|subset| subset.dedup());
     subsets.sort_by_key(|subset| std::cmp::Reverse(subset.len()));
     subsets.truncate(count);
@@ -330,7 +361,8 @@ mod tests {
         let world = World::chain(2, 0.2, 12);
         for seed in 0..10 {
             let elsewhere = World::chain(2, 0.2, 200 + seed);
-            let found = locate_single(&SingleParams::default(), &world.scene(), &elsewhere.queries()[0], seed);
+            let found =
+                locate_single(&SingleParams::default(), &world.scene(), &elsewhere.queries()[0], seed);
             assert_eq!(found.verdict, Verdict::NotLocalized);
         }
         let empty = setloc_features::ImageFeatures::default();

@@ -58,7 +58,10 @@ impl Place {
         for (i, position) in self.positions.iter().enumerate() {
             let in_camera = pose.inverse_transform_point(position);
             let distance = in_camera.norm();
-            let Some(pixel) = camera.project(&in_camera).filter(|_| distance < VISIBLE && distance > 2.0) else { continue };
+            let Some(pixel) = camera.project(&in_camera).filter(|_| distance < VISIBLE && distance > 2.0)
+            else {
+                continue;
+            };
             let noise = Vector2::new(normal(&mut rng), normal(&mut rng)) * NOISE_PX;
             let seen = pixel + noise;
             let (width, height) = (f64::from(camera.width), f64::from(camera.height));
@@ -77,7 +80,8 @@ impl Place {
                 noise_px: NOISE_PX as f32,
             });
             features.colors.push([128; 3]);
-            let changed = |&value: &u8| (i16::from(value) + rng.random_range(-change..=change)).clamp(0, 255) as u8;
+            let changed =
+                |&value: &u8| (i16::from(value) + rng.random_range(-change..=change)).clamp(0, 255) as u8;
             features.descriptors.extend(self.descriptors[source].iter().map(changed));
             shows.push((!wrong).then_some(i));
         }
@@ -142,7 +146,12 @@ impl World {
     pub(crate) fn chain(photos: usize, outliers: f64, seed: u64) -> Self {
         let place = Place::street(3500, seed);
         let poses: Vec<Rigid> = (0..photos)
-            .map(|i| along_street(Vector3::new(0.7 * (i % 3) as f64, -1.5, 20.0 + 6.0 * i as f64), 0.05 * (i % 2) as f64))
+            .map(|i| {
+                along_street(
+                    Vector3::new(0.7 * (i % 3) as f64, -1.5, 20.0 + 6.0 * i as f64),
+                    0.05 * (i % 2) as f64,
+                )
+            })
             .collect();
         Self::new(place, &poses, outliers, seed)
     }
@@ -178,7 +187,8 @@ impl World {
     /// Bends the local model: each photo, with the points it is the first to see, is turned by `angle` and stretched
     /// by `stretch` against the one before.
     pub(crate) fn bend(&mut self, angle: f64, stretch: f64) {
-        let poses: Vec<Rigid> = self.local.images.iter().map(|image| image.world_from_camera.unwrap()).collect();
+        let poses: Vec<Rigid> =
+            self.local.images.iter().map(|image| image.world_from_camera.unwrap()).collect();
         let mut drift = vec![Similarity::identity()];
         for i in 1..poses.len() {
             let at = poses[i - 1].translation;
@@ -214,7 +224,12 @@ impl World {
         self.photos
             .iter()
             .zip(&self.names)
-            .map(|(view, name)| QueryPhoto { name, camera: &self.camera, camera_fixed: true, features: &view.features })
+            .map(|(view, name)| QueryPhoto {
+                name,
+                camera: &self.camera,
+                camera_fixed: true,
+                features: &view.features,
+            })
             .collect()
     }
 
@@ -229,6 +244,8 @@ impl World {
         let in_scene: std::collections::BTreeSet<[u64; 3]> =
             self.scene_model.points.iter().map(|point| point.position.map(f64::to_bits).into()).collect();
         let shows = self.photos[photo].shows.iter().flatten();
-        shows.filter(|&&i| in_scene.contains(&<[u64; 3]>::from(self.place.positions[i].map(f64::to_bits)))).count()
+        shows
+            .filter(|&&i| in_scene.contains(&<[u64; 3]>::from(self.place.positions[i].map(f64::to_bits))))
+            .count()
     }
 }

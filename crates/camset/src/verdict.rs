@@ -22,7 +22,11 @@ pub(crate) struct Evidence {
 }
 
 /// Decides on the evidence for a pose alone: is it the right one?
-pub(crate) fn judge_support(params: &VerdictParams, evidence: &Evidence, reasons: &mut Vec<String>) -> Verdict {
+pub(crate) fn judge_support(
+    params: &VerdictParams,
+    evidence: &Evidence,
+    reasons: &mut Vec<String>,
+) -> Verdict {
     let Evidence { matches, inliers, log10_false_alarms, cells, runner_up, .. } = *evidence;
     reasons.push(format!("{inliers} of {matches} matches to the scene agree on the pose"));
     if inliers < params.min_inliers {
@@ -35,7 +39,9 @@ pub(crate) fn judge_support(params: &VerdictParams, evidence: &Evidence, reasons
         verdict = Verdict::Uncertain;
     };
     if !(log10_false_alarms <= params.max_log10_false_alarms) {
-        doubt(format!("random matches would agree as well (log10 of expected false alarms {log10_false_alarms:.1})"));
+        doubt(format!(
+            "random matches would agree as well (log10 of expected false alarms {log10_false_alarms:.1})"
+        ));
     }
     if cells < params.min_cells {
         doubt(format!("the agreeing matches lie in {cells} of 64 parts of the image only"));
@@ -65,7 +71,9 @@ pub(crate) fn judge_precision(
     }
     if !(center <= params.max_center_sigma * depth) {
         let share = 100.0 * center / depth;
-        reasons.push(format!("the centre is known to {center:.3} units only, {share:.0} % of the viewing distance"));
+        reasons.push(format!(
+            "the centre is known to {center:.3} units only, {share:.0} % of the viewing distance"
+        ));
         verdict = Verdict::Uncertain;
     }
     verdict
@@ -118,7 +126,9 @@ mod tests {
     #[test]
     fn an_imprecise_or_undetermined_pose_is_uncertain() {
         let params = VerdictParams::default();
-        let judge = |covariance: Option<Matrix6<f64>>| judge_precision(&params, covariance.as_ref(), 10.0, &mut Vec::new());
+        let judge = |covariance: Option<Matrix6<f64>>| {
+            judge_precision(&params, covariance.as_ref(), 10.0, &mut Vec::new())
+        };
         assert_eq!(judge(Some(Matrix6::identity() * 1e-4)), Verdict::Localized);
         assert_eq!(judge(Some(Matrix6::identity())), Verdict::Uncertain);
         assert_eq!(judge(Some(Matrix6::repeat(f64::NAN))), Verdict::Uncertain);

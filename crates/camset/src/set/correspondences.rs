@@ -59,7 +59,11 @@ pub(crate) fn correspondences(
     for matched in matched {
         used.insert(matched.scene);
         let local = matched.local as usize;
-        found.push(SetCorrespondence { scene: matched.scene, local: Some(local), seen_by: tracks[local].clone() });
+        found.push(SetCorrespondence {
+            scene: matched.scene,
+            local: Some(local),
+            seen_by: tracks[local].clone(),
+        });
     }
     if params.lone_rays {
         for (slot, &photo) in members.iter().enumerate() {
@@ -96,9 +100,12 @@ pub(crate) fn set_rays(
             let photo = &rays[slot];
             let sigma = photo.rays.sigmas[feature as usize];
             let pixel = photo.features.keypoints[feature as usize].pixel();
-            let Some(angle) = photo.camera.pixel_angle(&pixel).filter(|_| sigma.is_finite()) else { continue };
+            let Some(angle) = photo.camera.pixel_angle(&pixel).filter(|_| sigma.is_finite()) else {
+                continue;
+            };
             let drift = params.drift_px * angle / params.max_error_sigmas;
-            let direction: Vector3<f64> = set_from_camera[slot].rotation * photo.rays.bearings[feature as usize];
+            let direction: Vector3<f64> =
+                set_from_camera[slot].rotation * photo.rays.bearings[feature as usize];
             all.rays.push(SetRay {
                 origin: set_from_camera[slot].translation,
                 direction,
@@ -114,18 +121,33 @@ pub(crate) fn set_rays(
 
 impl SetRays {
     /// Truncated score: Σ over correspondences of the mean of 1 − min(1, (e/T)²) over their rays.
-    pub(crate) fn score(&self, world_from_set: &Similarity, max_error_sigmas: f64, correspondences: usize) -> f64 {
+    pub(crate) fn score(
+        &self,
+        world_from_set: &Similarity,
+        max_error_sigmas: f64,
+        correspondences: usize,
+    ) -> f64 {
         let set_from_world = world_from_set.inverse();
         let (mut gain, mut count) = (vec![0.0; correspondences], vec![0_usize; correspondences]);
         for (ray, &correspondence) in self.rays.iter().zip(&self.correspondence) {
-            gain[correspondence] += 1.0 - (ray.error_sigmas(&set_from_world) / max_error_sigmas).min(1.0).powi(2);
+            gain[correspondence] +=
+                1.0 - (ray.error_sigmas(&set_from_world) / max_error_sigmas).min(1.0).powi(2);
             count[correspondence] += 1;
         }
-        gain.iter().zip(&count).filter(|(_, count)| **count > 0).map(|(gain, &count)| gain / count as f64).sum()
+        gain.iter()
+            .zip(&count)
+            .filter(|(_, count)| **count > 0)
+            .map(|(gain, &count)| gain / count as f64)
+            .sum()
     }
 
     /// Correspondences of which at least half of the rays agree with a pose, ascending.
-    pub(crate) fn agreeing(&self, world_from_set: &Similarity, max_error_sigmas: f64, correspondences: usize) -> Vec<usize> {
+    pub(crate) fn agreeing(
+        &self,
+        world_from_set: &Similarity,
+        max_error_sigmas: f64,
+        correspondences: usize,
+    ) -> Vec<usize> {
         let set_from_world = world_from_set.inverse();
         let (mut good, mut count) = (vec![0_usize; correspondences], vec![0_usize; correspondences]);
         for (ray, &correspondence) in self.rays.iter().zip(&self.correspondence) {

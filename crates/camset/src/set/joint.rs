@@ -88,9 +88,11 @@ impl Component<'_> {
             scene_points[slot] += 1;
         }
         let set_rays = set_rays(params, self.scene.index, &set_from_camera, &rays, &candidates);
-        let rigid = rigid_pose(params, &candidates, &set_rays, &set_from_camera, self.members, self.evidence, seed);
+        let rigid =
+            rigid_pose(params, &candidates, &set_rays, &set_from_camera, self.members, self.evidence, seed);
         let Some(rigid) = rigid else {
-            let reasons = vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];
+            let reasons =
+                vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];
             return ComponentAnswer::Refused { reasons, scene_points };
         };
         let mut reasons = Vec::new();
@@ -104,12 +106,16 @@ impl Component<'_> {
         let undetermined = rigid.observability.undetermined();
         let mut rigid_support = support;
         if !undetermined.is_empty() {
-            reasons.push(format!("the rays of the rigid set do not determine its {}", undetermined.join(" and ")));
+            reasons.push(format!(
+                "the rays of the rigid set do not determine its {}",
+                undetermined.join(" and ")
+            ));
             rigid_support = Verdict::Uncertain;
         }
         let names: Vec<&str> = self.members.iter().map(|&photo| self.photos[photo].name).collect();
         let remarks = vec![format!("the local model of {}: {}", names.join(", "), reasons.join("; "))];
-        let rigid_answers = self.rigid_answers(&set_from_camera, &candidates, &rigid, rigid_support, &reasons);
+        let rigid_answers =
+            self.rigid_answers(&set_from_camera, &candidates, &rigid, rigid_support, &reasons);
         ComponentAnswer::Localized(Box::new(ComponentPoses {
             world_from_set: rigid.world_from_set,
             rigid: rigid_answers,
@@ -126,7 +132,9 @@ impl Component<'_> {
     fn rays<'c>(&'c self, cameras: &'c [Camera]) -> Vec<PhotoRays<'c>> {
         (0..self.members.len())
             .into_par_iter()
-            .map(|slot| PhotoRays::new(self.photos[self.members[slot]].features, &cameras[self.camera_of(slot)]))
+            .map(|slot| {
+                PhotoRays::new(self.photos[self.members[slot]].features, &cameras[self.camera_of(slot)])
+            })
             .collect()
     }
 
@@ -171,7 +179,12 @@ impl Component<'_> {
     }
 
     /// The paper's T_OPT, in rounds: observations are chosen under the present poses, then all poses move.
-    fn refine_jointly(&self, set_from_camera: &[Rigid], candidates: &[SetCorrespondence], rigid: &RigidPose) -> Joint {
+    fn refine_jointly(
+        &self,
+        set_from_camera: &[Rigid],
+        candidates: &[SetCorrespondence],
+        rigid: &RigidPose,
+    ) -> Joint {
         let world_from_set = &rigid.world_from_set;
         let mut model = JointModel {
             cameras: self.model.cameras.clone(),
@@ -184,7 +197,12 @@ impl Component<'_> {
                     world_from_camera: world_from_set.transform_pose(pose),
                 })
                 .collect(),
-            points: self.model.points.iter().map(|point| world_from_set.transform_point(&point.position)).collect(),
+            points: self
+                .model
+                .points
+                .iter()
+                .map(|point| world_from_set.transform_point(&point.position))
+                .collect(),
         };
         let mut covariances = Vec::new();
         for round in 0..=self.params.rounds {
@@ -272,7 +290,10 @@ impl Component<'_> {
                     None => own.push(found),
                 }
             }
-            lone[slot] = union(&inliers(&rays[slot], index, &model.photos[slot].world_from_camera, &lone[slot], bound), &own);
+            lone[slot] = union(
+                &inliers(&rays[slot], index, &model.photos[slot].world_from_camera, &lone[slot], bound),
+                &own,
+            );
         }
         let mut direct: Vec<Vec<SceneMatch>> = vec![Vec::new(); self.members.len()];
         let mut tied = BTreeSet::new();
@@ -281,7 +302,8 @@ impl Component<'_> {
             let best = votes
                 .into_iter()
                 .map(|(point, votes)| {
-                    let agreeing = track.iter().filter(|&&(slot, feature)| agrees(slot, feature, point)).count();
+                    let agreeing =
+                        track.iter().filter(|&&(slot, feature)| agrees(slot, feature, point)).count();
                     (agreeing, votes, std::cmp::Reverse(point))
                 })
                 .max();
@@ -330,10 +352,11 @@ impl Component<'_> {
             .flat_map(|point| {
                 let track = self.track(point);
                 let seen_twice = track.len() >= 2;
-                track
-                    .into_iter()
-                    .filter(move |_| seen_twice)
-                    .map(move |(photo, feature)| TrackObservation { photo, feature, point })
+                track.into_iter().filter(move |_| seen_twice).map(move |(photo, feature)| TrackObservation {
+                    photo,
+                    feature,
+                    point,
+                })
             })
             .collect()
     }
@@ -393,13 +416,18 @@ impl Component<'_> {
                 let mut reasons = reasons.to_vec();
                 let mut verdict = support;
                 if kept < MIN_KEPT {
-                    reasons.push(format!("{:.0} % of these matches fit after the joint refinement only", 100.0 * kept));
+                    reasons.push(format!(
+                        "{:.0} % of these matches fit after the joint refinement only",
+                        100.0 * kept
+                    ));
                     verdict = weaker(verdict, Verdict::Uncertain);
                 }
                 let depth = self.depth(joint, slot);
                 let covariance = joint.covariances.get(slot).copied().flatten();
-                verdict =
-                    weaker(verdict, judge_precision(&self.params.verdict, covariance.as_ref(), depth, &mut reasons));
+                verdict = weaker(
+                    verdict,
+                    judge_precision(&self.params.verdict, covariance.as_ref(), depth, &mut reasons),
+                );
                 let alone = &self.evidence[photo].alone;
                 if let Some(other) = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized) {
                     if same_pose(&pose, &other, depth) {

@@ -76,7 +76,8 @@ fn estimate(params: &CamsetParams, rays: &SetRays, seed: u64) -> Option<Similari
         CamsetMethod::Dlt => GeneralizedSolver::Dlt,
     };
     let options = GeneralizedPoseOptions { solver, ..GeneralizedPoseOptions::default() };
-    estimate_generalized_pose(&ransac, &generalized, &points, &options, seed).map(|found| found.world_from_set)
+    estimate_generalized_pose(&ransac, &generalized, &points, &options, seed)
+        .map(|found| found.world_from_set)
 }
 
 /// Support of the best pose that the remaining rays give, when it puts the set elsewhere.
@@ -90,7 +91,11 @@ fn runner_up(
 ) -> usize {
     let Some(pose) = estimate(params, rest, seed ^ 0x5eed) else { return 0 };
     let set_from_world = best.inverse();
-    let depth = rest.rays.iter().map(|ray| (set_from_world.transform_point(&ray.point) - ray.origin).norm()).sum::<f64>()
+    let depth = rest
+        .rays
+        .iter()
+        .map(|ray| (set_from_world.transform_point(&ray.point) - ray.origin).norm())
+        .sum::<f64>()
         / rest.rays.len().max(1) as f64
         * best.scale;
     let moved = set_from_camera
