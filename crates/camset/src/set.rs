@@ -142,19 +142,19 @@ fn keep_better(kept: &mut Option<PhotoLocalization>, other: PhotoLocalization) {
 
 /// Answers of the set, and where it has none, those of the photos alone.
 fn or_alone(answers: Vec<Option<PhotoLocalization>>, evidence: &[PhotoEvidence]) -> Vec<PhotoLocalization> {
+    let alone = |evidence: &PhotoEvidence| {
+        let mut alone = evidence.alone.clone();
+        let origin = match alone.verdict {
+            Verdict::NotLocalized => "neither its local model nor the photo alone is localized",
+            _ => "localized alone: no local model of the set leads to it",
+        };
+        alone.reasons.insert(0, origin.to_owned());
+        alone
+    };
     answers
         .into_iter()
         .zip(evidence)
-        .map(|(answer, evidence)| {
-            let mut best = answer;
-            let mut alone = evidence.alone.clone();
-            alone.reasons.insert(0, "localized alone: no local model of the set leads to it".to_owned());
-            if alone.verdict == Verdict::NotLocalized {
-                alone.reasons[0] = "neither its local model nor the photo alone is localized".to_owned();
-            }
-            keep_better(&mut best, alone.clone());
-            best.unwrap_or(alone)
-        })
+        .map(|(answer, evidence)| answer.unwrap_or_else(|| alone(evidence)))
         .collect()
 }
 

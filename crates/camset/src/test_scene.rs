@@ -7,7 +7,7 @@ use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoi
 use setloc_index::{IndexParams, SceneIndex};
 use setloc_sfm::synthetic::normal;
 use setloc_sfm::{
-    CameraId, ImageId, Observation, Reconstruction, ReconstructionImage, ReconstructionPoint, Rigid,
+    CameraId, ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint, Rigid,
     Similarity,
 };
 
@@ -89,8 +89,8 @@ impl Place {
     }
 }
 
-/// Model of views: a point for each place point that two views show, positions and poses true.
-pub(crate) fn model_of(place: &Place, views: &[View], camera: &Camera) -> Reconstruction {
+/// Model of views: a point for each place point that two views show (second: which), positions and poses true.
+fn model_of(place: &Place, views: &[View], camera: &Camera) -> (Reconstruction, Vec<usize>) {
     let mut tracks: Vec<Vec<Observation>> = vec![Vec::new(); place.positions.len()];
     for (image, view) in views.iter().enumerate() {
         for (feature, shown) in view.shows.iter().enumerate() {
@@ -110,16 +110,19 @@ pub(crate) fn model_of(place: &Place, views: &[View], camera: &Camera) -> Recons
         error_sigma: 1.0,
         track,
     };
-    Reconstruction {
+    let shown: Vec<usize> = (0..tracks.len()).filter(|&i| tracks[i].len() >= 2).collect();
+    let model = Reconstruction {
         cameras: vec![camera.clone()],
         images: views.iter().enumerate().map(image).collect(),
         points: tracks.into_iter().enumerate().filter(|(_, track)| track.len() >= 2).map(point).collect(),
-    }
+    };
+    (model, shown)
 }
 
 /// Panoramas, their model and index; a chain of photos and their local model.
 pub(crate) struct World {
-    pub place: Place,
+    /// Which point of the place each scene point is.
+    scene_points: Vec<usize>,
     panoramas: Vec<View>,
     pub scene_model: Reconstruction,
     pub index: SceneIndex,
@@ -128,8 +131,6 @@ pub(crate) struct World {
     pub names: Vec<String>,
     /// Local model in its own frame.
     pub local: Reconstruction,
-    /// Truth: scene from the local model's frame (before drift).
-    pub world_from_set: Similarity,
 }
 
 pub(crate) fn pinhole() -> Camera {
@@ -164,8 +165,15 @@ impl World {
                 place.view(&panorama, pose, 0.0, 8, seed * 1000 + i as u64)
             })
             .collect();
-        let scene_model = model_of(&place, &panoramas, &panorama);
+        let (mut scene_model, scene_points) = model_of(&place, &panoramas, &panorama);
         let features: Vec<&ImageFeatures> = panoramas.iter().map(|view| &view.features).collect();
+        let index = SceneIndex::build(&IndexParams::default(), &scene_model, &features);
+        // Scene points are as wrong as the panoramas' pixel noise leaves them.
+        let mut rng = ChaCha8Rng::seed_from_u64(seed * 1000 + 99);
+        for (i, point) in scene_model.points.iter_mut().enumerate() {
+            let factor = index.position_covariance(PointId(i as u32)).cholesky().unwrap().l();
+            point.position += factor * Vector3::from_fn(|_, _| normal(&mut rng));
+        }
         let index = SceneIndex::build(&IndexParams::default(), &scene_model, &features);
         let camera = pinhole();
         let photos: Vec<View> = poses
@@ -178,10 +186,10 @@ impl World {
             rotation: UnitQuaternion::from_euler_angles(0.4, 1.1, -0.3),
             translation: Vector3::new(4.0, -3.0, 25.0),
         };
-        let mut local = model_of(&place, &photos, &camera);
+        let (mut local, _) = model_of(&place, &photos, &camera);
         local.transform(&world_from_set.inverse());
         let names = (0..photos.len()).map(|i| format!("photo_{i:02}")).collect();
-        Self { place, panoramas, scene_model, index, camera, photos, names, local, world_from_set }
+        Self { scene_points, panoramas, scene_model, index, camera, photos, names, local }
     }
 
     /// Bends the local model: each photo, with the points it is the first to see, is turned by `angle` and stretched
@@ -241,11 +249,7 @@ impl World {
 
     /// How many features of a photo show a point of the scene.
     pub(crate) fn shared_with_scene(&self, photo: usize) -> usize {
-        let in_scene: std::collections::BTreeSet<[u64; 3]> =
-            self.scene_model.points.iter().map(|point| point.position.map(f64::to_bits).into()).collect();
         let shows = self.photos[photo].shows.iter().flatten();
-        shows
-            .filter(|&&i| in_scene.contains(&<[u64; 3]>::from(self.place.positions[i].map(f64::to_bits))))
-            .count()
+        shows.filter(|point| self.scene_points.binary_search(point).is_ok()).count()
     }
 }

@@ -414,6 +414,10 @@ impl Component<'_> {
                 let photo = self.members[slot];
                 let pose = joint.model.photos[slot].world_from_camera;
                 let mut reasons = reasons.to_vec();
+                let depth = self.depth(joint, slot);
+                let covariance = joint.covariances.get(slot).copied().flatten();
+                let precision =
+                    judge_precision(&self.params.verdict, covariance.as_ref(), depth, &mut reasons);
                 let mut verdict = support;
                 if kept < MIN_KEPT {
                     reasons.push(format!(
@@ -422,21 +426,18 @@ impl Component<'_> {
                     ));
                     verdict = weaker(verdict, Verdict::Uncertain);
                 }
-                let depth = self.depth(joint, slot);
-                let covariance = joint.covariances.get(slot).copied().flatten();
-                verdict = weaker(
-                    verdict,
-                    judge_precision(&self.params.verdict, covariance.as_ref(), depth, &mut reasons),
-                );
                 let alone = &self.evidence[photo].alone;
                 if let Some(other) = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized) {
+                    // The photo's own matches are evidence that the set's pose did not create.
                     if same_pose(&pose, &other, depth) {
                         reasons.push("localized alone, it stands at the same place".to_owned());
+                        verdict = Verdict::Localized;
                     } else {
                         reasons.push("localized alone, it stands elsewhere".to_owned());
-                        verdict = weaker(verdict, Verdict::Uncertain);
+                        verdict = Verdict::Uncertain;
                     }
                 }
+                let verdict = weaker(verdict, precision);
                 PhotoLocalization {
                     name: self.photos[photo].name.to_owned(),
                     camera: joint.model.cameras[self.camera_of(slot)].clone(),
