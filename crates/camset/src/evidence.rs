@@ -43,6 +43,21 @@ impl<'a> PhotoRays<'a> {
         ray_error_sigmas(&bearing_in_world, sigma, &offset, &index.position_covariance(found.point))
     }
 
+    /// Error of a feature that sees a point whose own uncertainty does not count, in standard deviations of the ray.
+    pub(crate) fn point_error_sigmas(
+        &self,
+        world_from_camera: &Rigid,
+        feature: u32,
+        point: &Vector3<f64>,
+    ) -> f64 {
+        let (bearing, sigma) = (self.rays.bearings[feature as usize], self.rays.sigmas[feature as usize]);
+        if !sigma.is_finite() {
+            return f64::INFINITY;
+        }
+        let offset = point - world_from_camera.translation;
+        ray_error_sigmas(&(world_from_camera.rotation * bearing), sigma, &offset, &nalgebra::Matrix3::zeros())
+    }
+
     /// Standard deviation of a match in pixels: of the keypoint and of the scene point together.
     pub(crate) fn match_noise_px(
         &self,

@@ -131,7 +131,8 @@ pub(crate) fn refine_jointly(
     if !with_covariance {
         return vec![None; model.photos.len()];
     }
-    covariances(&problem, params.loss)
+    // What is left are inliers: each counts in full.
+    covariances(&problem, RobustLoss::Trivial)
 }
 
 /// Covariances of all poses; where the whole is undetermined, of those that their fixed points determine alone.

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 use rayon::prelude::*;
 use setloc_index::NearestPoints;
-use setloc_sfm::Reconstruction;
+use setloc_sfm::{ImageId, Reconstruction};
 
 use crate::advice::widest_paths;
 use crate::single::locate_with_nearest;
@@ -56,7 +56,7 @@ pub fn locate_set(
     let mut photo_links: BTreeMap<(usize, usize), usize> = BTreeMap::new();
     for (number, model) in local_models.iter().enumerate() {
         let members: Vec<usize> =
-            model.registered().map(|id| id.index()).filter(|&photo| photo < photos.len()).collect();
+            model.registered().map(ImageId::index).filter(|&photo| photo < photos.len()).collect();
         if members.len() < 2 {
             continue;
         }
@@ -218,7 +218,7 @@ mod tests {
         let place = Place::street(3500, 4);
         let center = Vector3::new(0.0, -1.5, 22.0);
         let poses: Vec<_> = (0..4).map(|i| along_street(center, 0.1 * f64::from(i))).collect();
-        let world = World::new(place, &poses, 0.1, 4);
+        let world = World::new(&place, &poses, 0.1, 4);
         let found = locate(&world, &CamsetParams::default());
         for (i, photo) in found.rigid.iter().enumerate() {
             assert_ne!(photo.verdict, Verdict::Localized);
@@ -250,7 +250,7 @@ mod tests {
         let place = Place::street(3500, 6);
         let poses: Vec<_> =
             (0..4).map(|i| along_street(Vector3::new(0.0, -1.5, 18.0 + 3.0 * f64::from(i)), 0.0)).collect();
-        let mut world = World::new(place, &poses, 0.1, 6);
+        let mut world = World::new(&place, &poses, 0.1, 6);
         world.split_scene(Vector3::new(300.0, 0.0, 0.0));
         let found = locate(&world, &CamsetParams::default());
         for photo in &found.refined {
@@ -274,5 +274,39 @@ mod tests {
     fn the_same_seed_gives_the_same_answer() {
         let world = World::chain(5, 0.3, 9);
         assert_eq!(locate(&world, &CamsetParams::default()), locate(&world, &CamsetParams::default()));
+    }
+
+    /// Mean squared normalized error of the six pose parameters, whose expectation is 1, of target and first photo.
+    fn mean_squared_normalized_error(seeds: std::ops::Range<u64>) -> [f64; 2] {
+        let count = (seeds.end - seeds.start) as f64;
+        let mut sums = [0.0; 2];
+        for seed in seeds {
+            let world = World::chain(6, 0.2, seed);
+            let found = locate(&world, &CamsetParams::default());
+            for (sum, photo) in sums.iter_mut().zip([5, 0]) {
+                let answer = &found.refined[photo];
+                let (pose, covariance) = (answer.world_from_camera.unwrap(), answer.covariance.unwrap());
+                let truth = &world.photos[photo].pose;
+                let turn = (pose.rotation.inverse() * truth.rotation).scaled_axis();
+                let shift = truth.translation - pose.translation;
+                let error = nalgebra::Vector6::new(turn.x, turn.y, turn.z, shift.x, shift.y, shift.z);
+                *sum += error.dot(&(covariance.try_inverse().unwrap() * error)) / 6.0;
+            }
+        }
+        sums.map(|sum| sum / count)
+    }
+
+    #[test]
+    fn errors_fit_the_covariance() {
+        let mean = mean_squared_normalized_error(1000..1024);
+        assert!(mean.iter().all(|mean| (0.5..1.6).contains(mean)), "{mean:?}");
+    }
+
+    #[test]
+    #[ignore = "takes minutes; prints the figures"]
+    fn measure_calibration_over_five_hundred_trials() {
+        let mean = mean_squared_normalized_error(5000..5500);
+        println!("mean squared normalized error: target {:.3}, first photo {:.3}", mean[0], mean[1]);
+        assert!(mean.iter().all(|mean| (0.8..1.25).contains(mean)), "{mean:?}");
     }
 }

@@ -285,7 +285,9 @@ fn covisible_subsets(index: &SceneIndex, matches: &[SceneMatch], count: usize) -
     }
     let mut subsets: Vec<Vec<SceneMatch>> =
         by_image.into_values().filter(|subset| subset.len() > SAMPLE).collect();
-    subsets.iter_mut().for_each(|subset| subset.dedup());
+    for subset in &mut subsets {
+        subset.dedup();
+    }
     subsets.sort_by_key(|subset| std::cmp::Reverse(subset.len()));
     subsets.truncate(count);
     subsets

@@ -154,10 +154,10 @@ impl World {
                 )
             })
             .collect();
-        Self::new(place, &poses, outliers, seed)
+        Self::new(&place, &poses, outliers, seed)
     }
 
-    pub(crate) fn new(place: Place, poses: &[Rigid], outliers: f64, seed: u64) -> Self {
+    pub(crate) fn new(place: &Place, poses: &[Rigid], outliers: f64, seed: u64) -> Self {
         let panorama = Camera::equirectangular(3000, 1500);
         let panoramas: Vec<View> = (0..8)
             .map(|i| {
@@ -165,7 +165,7 @@ impl World {
                 place.view(&panorama, pose, 0.0, 8, seed * 1000 + i as u64)
             })
             .collect();
-        let (mut scene_model, scene_points) = model_of(&place, &panoramas, &panorama);
+        let (mut scene_model, scene_points) = model_of(place, &panoramas, &panorama);
         let features: Vec<&ImageFeatures> = panoramas.iter().map(|view| &view.features).collect();
         let index = SceneIndex::build(&IndexParams::default(), &scene_model, &features);
         // Scene points are as wrong as the panoramas' pixel noise leaves them.
@@ -186,7 +186,7 @@ impl World {
             rotation: UnitQuaternion::from_euler_angles(0.4, 1.1, -0.3),
             translation: Vector3::new(4.0, -3.0, 25.0),
         };
-        let (mut local, _) = model_of(&place, &photos, &camera);
+        let (mut local, _) = model_of(place, &photos, &camera);
         local.transform(&world_from_set.inverse());
         let names = (0..photos.len()).map(|i| format!("photo_{i:02}")).collect();
         Self { scene_points, panoramas, scene_model, index, camera, photos, names, local }

@@ -149,7 +149,9 @@ impl SceneIndex {
                 let (mine, others) = rest.split_at(self.rows_of(point).len());
                 rest = others;
                 let mut merged = NearestPoints::default();
-                mine.iter().for_each(|nearest| merged.merge(nearest));
+                for nearest in mine {
+                    merged.merge(nearest);
+                }
                 merged
             })
             .collect()

@@ -220,7 +220,7 @@ impl Component<'_> {
         }
         let rays = self.rays(&model.cameras);
         let direct = self.observations(&model, &rays, candidates, 1.0).direct;
-        Joint { direct, covariances, model }
+        Joint { model, direct, covariances }
     }
 
     /// A camera is known when all photos that share it say so.
@@ -322,7 +322,8 @@ impl Component<'_> {
             let agreeing = inliers(&rays[slot], index, &model.photos[slot].world_from_camera, lone, bound);
             direct[slot] = unique(union(&direct[slot], &agreeing));
         }
-        Observations { direct, tracks: self.free_tracks(&tied) }
+        let tracks = agreeing_tracks(model, rays, self.free_tracks(&tied), bound);
+        Observations { direct, tracks }
     }
 
     /// Slots and features that see a local point.
@@ -464,6 +465,26 @@ impl Component<'_> {
             })
             .unwrap_or(0.0)
     }
+}
+
+/// The observations that agree with the present poses and local points; points seen once only are left out.
+fn agreeing_tracks(
+    model: &JointModel,
+    rays: &[PhotoRays<'_>],
+    tracks: Vec<TrackObservation>,
+    bound: f64,
+) -> Vec<TrackObservation> {
+    let mut seen = vec![0_usize; model.points.len()];
+    let mut agreeing = tracks;
+    agreeing.retain(|track| {
+        let pose = &model.photos[track.photo].world_from_camera;
+        let agrees =
+            rays[track.photo].point_error_sigmas(pose, track.feature, &model.points[track.point]) < bound;
+        seen[track.point] += usize::from(agrees);
+        agrees
+    });
+    agreeing.retain(|track| seen[track.point] >= 2);
+    agreeing
 }
 
 /// Each feature once, by its first match; sorted.

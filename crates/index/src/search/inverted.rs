@@ -102,11 +102,10 @@ fn update_centroids(centroids: &mut [u8], descriptors: &[u8], training: &[usize]
             *sum += u32::from(byte);
         }
     }
-    for list in 0..lists {
-        if counts[list] > 0 {
-            for i in list * DESCRIPTOR_LEN..(list + 1) * DESCRIPTOR_LEN {
-                centroids[i] = ((sums[i] + counts[list] / 2) / counts[list]) as u8;
-            }
+    for (i, centroid) in centroids.iter_mut().enumerate() {
+        let count = counts[i / DESCRIPTOR_LEN];
+        if let Some(mean) = (sums[i] + count / 2).checked_div(count) {
+            *centroid = mean as u8;
         }
     }
 }

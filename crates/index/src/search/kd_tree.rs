@@ -107,6 +107,6 @@ impl PrincipalTree {
             return Vec::new();
         };
         let nearest = tree.query(&self.project(query)).nearest_n::<SquaredEuclidean<f32>>(count).execute();
-        nearest.into_iter().map(|item| item.item as u32).collect()
+        nearest.into_iter().map(|item| item.item).collect()
     }
 }
