@@ -1,1 +1,188 @@
 //! Sparse bundle adjustment on the sphere.
+//!
+//! Minimizes ½ Σ ρ(‖e‖²/σ²) over poses, points and intrinsics. e compares the observed bearing κ(u) with the direction
+//! to the point: ‖e‖ = 2 tan(θ/2) over the whole sphere, θ the angle between them, so that panoramas and photos live in
+//! one problem, nothing happens at a seam, and a point behind the ray is far from explained (the paper's chord
+//! ‖κ(u) − PX/‖PX‖‖ = 2 sin(θ/2) agrees to third order). σ is the angle that the observation's pixel noise spans at
+//! its place of the image.
+//!
+//! Levenberg–Marquardt with analytic Jacobians; points are eliminated (Schur complement) and the reduced camera system
+//! is factorized by Cholesky, dense or sparse. Robust losses act by first-order reweighting (ρ′ on residual and
+//! Jacobian; the second-order term of Triggs' correction is left out, as it makes the model indefinite).
+//!
+//! Tangents: a pose is perturbed as R ← R·Exp(ω), t ← t + δ with (R, t) = `world_from_camera`: ω in the camera frame,
+//! δ in the world frame, order (ω, δ). Points and intrinsics are perturbed by addition.
+//!
+//! Gauge: what is fixed, and position priors, hold the frame. When they do not (nothing fixed), the damping does: the
+//! steps are the shortest, the frame stays near where it was, and no observation is weakened by an arbitrary anchor.
+//!
+//! Work runs on the current rayon pool; results are the same bytes for any number of threads.
+
+mod camera_system;
+mod levenberg_marquardt;
+mod loss;
+mod normal_equations;
+mod pattern;
+mod problem;
+mod residual;
+mod spherical;
+
+use nalgebra::Matrix6;
+use serde::{Deserialize, Serialize};
+
+use levenberg_marquardt::{Limits, minimize};
+use normal_equations::NormalEquations;
+use spherical::{Layout, POSE_DIM, Spherical};
+
+pub use levenberg_marquardt::Termination;
+pub use loss::RobustLoss;
+pub use problem::{
+    BundleObservation, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom, PositionPrior,
+};
+
+/// S counts as singular when it has an eigenvalue below this, relative to the diagonal of JᵀJ.
+const SINGULAR_SHARE: f64 = 1e-13;
+
+/// How to minimize.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BundleParams {
+    /// Loss on whitened residuals.
+    pub loss: RobustLoss,
+    /// Most steps tried.
+    pub max_iterations: u32,
+    /// Ends when a step decreases the cost by less than this share.
+    pub function_tolerance: f64,
+    /// Ends when a step is shorter than this share of the parameters' norm.
+    pub parameter_tolerance: f64,
+}
+
+impl Default for BundleParams {
+    fn default() -> Self {
+        Self {
+            loss: RobustLoss::Trivial,
+            max_iterations: 50,
+            function_tolerance: 1e-6,
+            parameter_tolerance: 1e-10,
+        }
+    }
+}
+
+/// What happened.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct BundleReport {
+    /// ½ Σ ρ before, over what was used.
+    pub initial_cost: f64,
+    /// ½ Σ ρ after.
+    pub final_cost: f64,
+    /// Steps tried.
+    pub iterations: u32,
+    /// Steps that decreased the cost.
+    pub accepted_steps: u32,
+    /// Why it ended.
+    pub termination: Termination,
+    /// Observations used.
+    pub observations: usize,
+    /// Observations and priors that could not be used.
+    pub ignored: usize,
+    /// Scalar residuals (two per observation, three per prior) minus scalar unknowns; a free gauge is not subtracted.
+    pub degrees_of_freedom: i64,
+}
+
+/// Minimizes the cost of a problem in place.
+///
+/// What is fixed stays bit-identical, as does everything when no step decreases the cost. Never fails: a problem
+/// without anything to do, or without a finite cost, is said in the report.
+pub fn solve(params: &BundleParams, problem: &mut BundleProblem) -> BundleReport {
+    let loss = if params.loss.is_valid() { params.loss } else { RobustLoss::Trivial };
+    let (mut model, layout) = Spherical::new(problem, loss);
+    let Layout { links, points, free, point_of_index, extra_dims, ignored, priors } = layout;
+    let observations = links.len();
+    let mut equations =
+        NormalEquations::<POSE_DIM>::new(links, points, free, model.block_count(), &extra_dims);
+    let unknowns = equations.unknowns();
+    let mut report = BundleReport {
+        initial_cost: 0.0,
+        final_cost: 0.0,
+        iterations: 0,
+        accepted_steps: 0,
+        termination: Termination::NothingToDo,
+        observations,
+        ignored,
+        degrees_of_freedom: (2 * observations + 3 * priors) as i64 - unknowns as i64,
+    };
+    if unknowns == 0 {
+        report.initial_cost = equations.linearize(&model);
+        report.final_cost = report.initial_cost;
+        return report;
+    }
+    let limits = Limits {
+        max_iterations: params.max_iterations,
+        function_tolerance: params.function_tolerance,
+        parameter_tolerance: params.parameter_tolerance,
+    };
+    let outcome = minimize(&mut model, &mut equations, &limits);
+    report.initial_cost = outcome.initial_cost;
+    report.final_cost = outcome.final_cost;
+    report.iterations = outcome.iterations;
+    report.accepted_steps = outcome.accepted;
+    report.termination = outcome.termination;
+    if outcome.accepted > 0 {
+        model.store(problem);
+        for (&index, position) in point_of_index.iter().zip(equations.points()) {
+            let point = &mut problem.points[index as usize];
+            if !point.fixed {
+                point.position = *position;
+            }
+        }
+    }
+    report
+}
+
+/// Marginal covariances of poses, 6×6 each, in the order asked for.
+///
+/// Blocks of the inverse of the reduced camera system at the problem's current state, so points and intrinsics are
+/// marginalized; tangent order and sides as in the module's documentation (rotation in the camera frame in rad²,
+/// translation in the world frame in its unit squared). A fixed pose has covariance zero. With a robust loss,
+/// observations count by their weight ρ′.
+///
+/// `None` when a pose asked for does not exist or has no observation, or when the problem leaves the gauge or anything
+/// else on the camera side undetermined.
+pub fn covariance(problem: &BundleProblem, loss: RobustLoss, poses: &[u32]) -> Option<Vec<Matrix6<f64>>> {
+    let (model, layout) = Spherical::new(problem, loss);
+    let blocks = poses
+        .iter()
+        .map(|&pose| match model.block_of_pose(pose) {
+            Some(block) => Some(Some(block)),
+            None => problem.poses.get(pose as usize).filter(|pose| pose.fixed).map(|_| None),
+        })
+        .collect::<Option<Vec<_>>>()?;
+    if blocks.iter().all(Option::is_none) {
+        return Some(vec![Matrix6::zeros(); poses.len()]);
+    }
+    let Layout { links, points, free, extra_dims, .. } = layout;
+    let mut equations =
+        NormalEquations::<POSE_DIM>::new(links, points, free, model.block_count(), &extra_dims);
+    let cost = equations.linearize(&model);
+    if !cost.is_finite() || !equations.is_definite_by(SINGULAR_SHARE) || !equations.factorize(0.0) {
+        return None;
+    }
+    let mut column = vec![0.0; equations.step().len()];
+    let mut inverse_block = |block: usize| {
+        let mut result = Matrix6::zeros();
+        for k in 0..POSE_DIM {
+            column.fill(0.0);
+            column[block * POSE_DIM + k] = 1.0;
+            equations.solve_camera_side(&mut column);
+            for row in 0..POSE_DIM {
+                result[(row, k)] = column[block * POSE_DIM + row];
+            }
+        }
+        let symmetric = (result + result.transpose()) * 0.5;
+        symmetric.iter().all(|value| value.is_finite()).then_some(symmetric)
+    };
+    blocks.into_iter().map(|block| block.map_or(Some(Matrix6::zeros()), &mut inverse_block)).collect()
+}
+
+#[cfg(test)]
+mod tests;

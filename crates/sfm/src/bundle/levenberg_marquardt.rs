@@ -1,0 +1,115 @@
+//! Levenberg–Marquardt on any [`Model`].
+
+use serde::{Deserialize, Serialize};
+
+use super::normal_equations::{Model, NormalEquations};
+
+/// Damping of the first step.
+const INITIAL_LAMBDA: f64 = 1e-4;
+/// Least damping: keeps a free gauge, and points seen once, from wandering on round-off.
+const MIN_LAMBDA: f64 = 1e-10;
+/// Damping at which no useful step is left.
+const MAX_LAMBDA: f64 = 1e16;
+
+/// Why the iterations ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Termination {
+    /// The last step changed the cost, or the parameters, by less than the tolerance, or none was predicted to.
+    Converged,
+    /// The iteration limit was reached.
+    IterationLimit,
+    /// No step decreased the cost although one was predicted to.
+    NoDecrease,
+    /// Nothing is free, or nothing constrains it.
+    NothingToDo,
+    /// The initial state has no finite cost.
+    NotFinite,
+}
+
+/// Limits of the iterations.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Limits {
+    pub max_iterations: u32,
+    pub function_tolerance: f64,
+    pub parameter_tolerance: f64,
+}
+
+/// What the iterations did.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Outcome {
+    pub initial_cost: f64,
+    pub final_cost: f64,
+    pub iterations: u32,
+    pub accepted: u32,
+    pub termination: Termination,
+}
+
+/// Minimizes the cost; the best state is the model's and the equations' current one.
+///
+/// Damping λ·diag(JᵀJ), which makes the steps independent of the units of the unknowns. λ follows the ratio of actual
+/// to predicted decrease: H. B. Nielsen, "Damping Parameter in Marquardt's Method", IMM-REP-1999-05.
+pub(super) fn minimize<const D: usize, M: Model<D>>(
+    model: &mut M,
+    equations: &mut NormalEquations<D>,
+    limits: &Limits,
+) -> Outcome {
+    let mut cost = equations.linearize(model);
+    let mut outcome = Outcome {
+        initial_cost: cost,
+        final_cost: cost,
+        iterations: 0,
+        accepted: 0,
+        termination: Termination::IterationLimit,
+    };
+    if !cost.is_finite() {
+        outcome.termination = Termination::NotFinite;
+        return outcome;
+    }
+    let (mut lambda, mut growth) = (INITIAL_LAMBDA, 2.0);
+    while outcome.iterations < limits.max_iterations {
+        outcome.iterations += 1;
+        let sums = if equations.factorize(lambda) { equations.solve(lambda) } else { None };
+        if let Some(sums) = sums {
+            // Below this neither the costs' difference nor the decision by it means anything.
+            if !(sums.predicted > f64::EPSILON * cost) {
+                outcome.termination = Termination::Converged;
+                break;
+            }
+            let candidate =
+                if model.propose(equations.step()) { equations.candidate_cost(model) } else { f64::INFINITY };
+            let small = limits.parameter_tolerance * (sums.squared_norm + model.squared_norm()).sqrt();
+            let is_small_step = sums.squared_step.sqrt() <= small;
+            if candidate < cost {
+                let decrease = cost - candidate;
+                let ratio = decrease / sums.predicted;
+                model.accept();
+                equations.accept();
+                outcome.accepted += 1;
+                cost = candidate;
+                lambda = (lambda * (1.0 - (2.0 * ratio - 1.0).powi(3)).max(1.0 / 3.0)).max(MIN_LAMBDA);
+                growth = 2.0;
+                if decrease <= limits.function_tolerance * cost || is_small_step {
+                    outcome.termination = Termination::Converged;
+                    break;
+                }
+                if outcome.iterations < limits.max_iterations {
+                    equations.linearize(model);
+                }
+                continue;
+            }
+            if is_small_step {
+                outcome.termination = Termination::Converged;
+                break;
+            }
+        }
+        lambda *= growth;
+        growth *= 2.0;
+        if lambda > MAX_LAMBDA {
+            outcome.termination = Termination::NoDecrease;
+            break;
+        }
+    }
+    outcome.final_cost = cost;
+    outcome
+}

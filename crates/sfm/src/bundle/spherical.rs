@@ -1,0 +1,471 @@
+//! A [`BundleProblem`] as a [`Model`]: angular residuals, poses of 6 scalars, intrinsics as extra blocks.
+
+use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector2, Vector3};
+use setloc_features::{Camera, CameraModel, MAX_CAMERA_PARAMS};
+
+use super::normal_equations::{Linearized, Link, Model};
+use super::pattern::NONE;
+use super::residual::{angular, angular_squared, bearing_change, point_row, rotation_row};
+use super::{BundleProblem, IntrinsicsFreedom, RobustLoss};
+use crate::Rigid;
+
+/// Scalars of a pose: rotation (right perturbation, camera frame), then translation (world frame).
+pub(super) const POSE_DIM: usize = 6;
+
+/// A pose as the inner loops want it.
+#[derive(Debug, Clone, Copy)]
+struct PoseState {
+    world_from_camera: Rigid,
+    rotation: Matrix3<f64>,
+}
+
+impl PoseState {
+    fn new(world_from_camera: Rigid) -> Self {
+        Self { world_from_camera, rotation: *world_from_camera.rotation.to_rotation_matrix().matrix() }
+    }
+
+    #[inline]
+    fn camera_point(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.rotation.tr_mul(&(point - self.world_from_camera.translation))
+    }
+}
+
+/// One usable observation.
+#[derive(Debug, Clone, Copy)]
+struct Ray {
+    pose: u32,
+    /// Bearing and 1/σ while the intrinsics stay as they were at the start.
+    bearing: Vector3<f64>,
+    inverse_sigma: f64,
+}
+
+/// Pixel and camera of an observation whose intrinsics are estimated.
+#[derive(Debug, Clone, Copy)]
+struct PixelRay {
+    camera: u32,
+    pixel: Vector2<f64>,
+    noise_px: f64,
+}
+
+/// One usable prior on a free pose.
+#[derive(Debug, Clone, Copy)]
+struct Prior {
+    pose: u32,
+    position: Vector3<f64>,
+    inverse_sigma: f64,
+    loss: RobustLoss,
+}
+
+/// The problem, compacted to what is used, with current and candidate state of the camera side.
+pub(super) struct Spherical {
+    loss: RobustLoss,
+    rays: Vec<Ray>,
+    /// Parallel to `rays` when any intrinsics are free, else empty.
+    pixel_rays: Vec<PixelRay>,
+    poses: Vec<PoseState>,
+    candidate_poses: Vec<PoseState>,
+    /// Poses of the blocks, ascending.
+    pose_of_block: Vec<u32>,
+    block_of_pose: Vec<u32>,
+    cameras: Vec<Camera>,
+    candidate_cameras: Vec<Camera>,
+    /// Camera and its free parameters, per extra block.
+    intrinsics: Vec<(u32, Vec<usize>)>,
+    priors: Vec<Prior>,
+}
+
+/// How a problem maps to unknowns.
+pub(super) struct Layout {
+    pub links: Vec<Link>,
+    pub points: Vec<Vector3<f64>>,
+    pub free: Vec<bool>,
+    /// Index in the problem of each compacted point.
+    pub point_of_index: Vec<u32>,
+    pub extra_dims: Vec<usize>,
+    pub ignored: usize,
+    /// Priors used and weighed, of free poses.
+    pub priors: usize,
+}
+
+impl Spherical {
+    /// Drops what is unusable or unused and sorts the rest by point.
+    pub fn new(problem: &BundleProblem, loss: RobustLoss) -> (Self, Layout) {
+        let pose_usable: Vec<bool> = problem
+            .poses
+            .iter()
+            .map(|pose| {
+                let Rigid { rotation, translation } = pose.world_from_camera;
+                (pose.camera as usize) < problem.cameras.len()
+                    && rotation.coords.iter().chain(translation.iter()).all(|value| value.is_finite())
+            })
+            .collect();
+        let usable_ray = |observation: &super::BundleObservation| {
+            if !*pose_usable.get(observation.pose as usize)? {
+                return None;
+            }
+            let point = problem.points.get(observation.point as usize)?.position;
+            let camera = &problem.cameras[problem.poses[observation.pose as usize].camera as usize];
+            if !(point.x + point.y + point.z).is_finite() {
+                return None;
+            }
+            let (bearing, inverse_sigma) =
+                bearing_and_weight(camera, &observation.pixel, observation.noise_px)?;
+            Some(Ray { pose: observation.pose, bearing, inverse_sigma })
+        };
+        let usable: Vec<(u32, Ray)> = problem
+            .observations
+            .iter()
+            .enumerate()
+            .filter_map(|(index, observation)| Some((index as u32, usable_ray(observation)?)))
+            .collect();
+
+        // Counting sort by point; within a point the order given stays.
+        let mut starts = vec![0_u32; problem.points.len() + 1];
+        for (index, _) in &usable {
+            starts[problem.observations[*index as usize].point as usize + 1] += 1;
+        }
+        let mut points = Vec::new();
+        let (mut free, mut point_of_index, mut compact) =
+            (Vec::new(), Vec::new(), vec![NONE; problem.points.len()]);
+        for (index, point) in problem.points.iter().enumerate() {
+            if starts[index + 1] > 0 {
+                compact[index] = points.len() as u32;
+                points.push(point.position);
+                free.push(!point.fixed);
+                point_of_index.push(index as u32);
+            }
+            starts[index + 1] += starts[index];
+        }
+        let mut order = vec![0_u32; usable.len()];
+        for (position, (index, _)) in usable.iter().enumerate() {
+            let start = &mut starts[problem.observations[*index as usize].point as usize];
+            order[*start as usize] = position as u32;
+            *start += 1;
+        }
+
+        let mut is_block = vec![false; problem.poses.len()];
+        for (_, ray) in &usable {
+            is_block[ray.pose as usize] = true;
+        }
+        let mut ignored = problem.observations.len() - usable.len();
+        let mut priors = Vec::new();
+        for prior in &problem.position_priors {
+            let pose = prior.pose as usize;
+            let valid = pose_usable.get(pose) == Some(&true)
+                && (prior.position.x + prior.position.y + prior.position.z).is_finite()
+                && prior.sigma.is_finite()
+                && prior.sigma > 0.0
+                && prior.loss.is_valid();
+            if !valid {
+                ignored += 1;
+            } else if !problem.poses[pose].fixed {
+                is_block[pose] = true;
+                priors.push(Prior {
+                    pose: prior.pose,
+                    position: prior.position,
+                    inverse_sigma: 1.0 / prior.sigma,
+                    loss: prior.loss,
+                });
+            }
+        }
+        let mut block_of_pose = vec![NONE; problem.poses.len()];
+        let mut pose_of_block = Vec::new();
+        for (index, pose) in problem.poses.iter().enumerate() {
+            if is_block[index] && !pose.fixed {
+                block_of_pose[index] = pose_of_block.len() as u32;
+                pose_of_block.push(index as u32);
+            }
+        }
+
+        // A camera without observations is no unknown.
+        let mut is_seen = vec![false; problem.cameras.len()];
+        for (_, ray) in &usable {
+            is_seen[problem.poses[ray.pose as usize].camera as usize] = true;
+        }
+        let (mut intrinsics, mut extra_of_camera) = (Vec::new(), vec![NONE; problem.cameras.len()]);
+        for (index, camera) in problem.cameras.iter().enumerate().filter(|&(index, _)| is_seen[index]) {
+            let freedom = problem.camera_freedom.get(index).copied().unwrap_or(IntrinsicsFreedom::FIXED);
+            let parameters = free_parameters(camera, freedom);
+            if !parameters.is_empty() {
+                extra_of_camera[index] = intrinsics.len() as u32;
+                intrinsics.push((index as u32, parameters));
+            }
+        }
+
+        let (mut rays, mut links) = (Vec::with_capacity(usable.len()), Vec::with_capacity(usable.len()));
+        let mut pixel_rays = Vec::new();
+        for &position in &order {
+            let (index, ray) = usable[position as usize];
+            let observation = &problem.observations[index as usize];
+            let camera = problem.poses[ray.pose as usize].camera;
+            rays.push(ray);
+            links.push(Link {
+                point: compact[observation.point as usize],
+                block: block_of_pose[ray.pose as usize],
+                extra: extra_of_camera[camera as usize],
+            });
+            if !intrinsics.is_empty() {
+                pixel_rays.push(PixelRay {
+                    camera,
+                    pixel: observation.pixel,
+                    noise_px: observation.noise_px,
+                });
+            }
+        }
+
+        let poses: Vec<_> = problem.poses.iter().map(|pose| PoseState::new(pose.world_from_camera)).collect();
+        let layout = Layout {
+            links,
+            points,
+            free,
+            point_of_index,
+            extra_dims: intrinsics.iter().map(|(_, parameters)| parameters.len()).collect(),
+            ignored,
+            priors: priors.len(),
+        };
+        let model = Self {
+            loss,
+            rays,
+            pixel_rays,
+            candidate_poses: poses.clone(),
+            poses,
+            pose_of_block,
+            block_of_pose,
+            candidate_cameras: problem.cameras.clone(),
+            cameras: problem.cameras.clone(),
+            intrinsics,
+            priors,
+        };
+        (model, layout)
+    }
+
+    /// Number of pose blocks.
+    pub fn block_count(&self) -> usize {
+        self.pose_of_block.len()
+    }
+
+    /// Block of a pose, when it is an unknown.
+    pub fn block_of_pose(&self, pose: u32) -> Option<usize> {
+        self.block_of_pose.get(pose as usize).filter(|&&block| block != NONE).map(|&block| block as usize)
+    }
+
+    /// Writes the current state of everything that is free.
+    pub fn store(&self, problem: &mut BundleProblem) {
+        for &pose in &self.pose_of_block {
+            problem.poses[pose as usize].world_from_camera = self.poses[pose as usize].world_from_camera;
+        }
+        for (camera, _) in &self.intrinsics {
+            problem.cameras[*camera as usize].clone_from(&self.cameras[*camera as usize]);
+        }
+    }
+
+    fn prior_residual(&self, prior: &Prior, poses: &[PoseState]) -> Vector3<f64> {
+        (poses[prior.pose as usize].world_from_camera.translation - prior.position) * prior.inverse_sigma
+    }
+}
+
+impl Model<POSE_DIM> for Spherical {
+    fn loss(&self) -> RobustLoss {
+        self.loss
+    }
+
+    #[inline]
+    fn linearize(
+        &self,
+        observation: usize,
+        link: &Link,
+        point: &Vector3<f64>,
+        out: &mut Linearized<POSE_DIM>,
+    ) {
+        let ray = &self.rays[observation];
+        let pose = &self.poses[ray.pose as usize];
+        let (mut bearing, mut weight) = (ray.bearing, ray.inverse_sigma);
+        let mut jacobian = None;
+        if link.extra != NONE {
+            let PixelRay { camera, pixel, noise_px } = &self.pixel_rays[observation];
+            if let Some(of_camera) = unproject_with_jacobian(&self.cameras[*camera as usize], pixel) {
+                bearing = of_camera.bearing;
+                weight = 1.0 / (of_camera.pixel_angle * noise_px);
+                jacobian = Some(of_camera);
+            }
+        }
+        let x = pose.camera_point(point);
+        let angular = angular(&bearing, &x);
+        out.extra = [[0.0; MAX_CAMERA_PARAMS]; 2];
+        for row in 0..2 {
+            out.residual[row] = weight * angular.residual[row];
+            let m = angular.wrt_camera_point[row] * weight;
+            let by_point = point_row(&m, &pose.rotation);
+            out.point[row] = by_point.into();
+            if link.block != NONE {
+                let by_rotation = rotation_row(&m, &x);
+                out.block[row] =
+                    [by_rotation.x, by_rotation.y, by_rotation.z, -by_point.x, -by_point.y, -by_point.z];
+            }
+        }
+        if let Some(jacobian) = jacobian {
+            for (k, &parameter) in self.intrinsics[link.extra as usize].1.iter().enumerate() {
+                let db = jacobian.d_params.column(parameter).into_owned();
+                let change = bearing_change(&bearing, &angular.direction, &db);
+                let log_sigma = jacobian.d_log_pixel_angle[parameter];
+                for row in 0..2 {
+                    out.extra[row][k] =
+                        weight * angular.wrt_direction[row].dot(&change) - out.residual[row] * log_sigma;
+                }
+            }
+        }
+    }
+
+    #[inline]
+    fn squared_residual(&self, observation: usize, point: &Vector3<f64>) -> f64 {
+        let ray = &self.rays[observation];
+        let (mut bearing, mut weight) = (ray.bearing, ray.inverse_sigma);
+        if let Some(PixelRay { camera, pixel, noise_px }) = self.pixel_rays.get(observation) {
+            let camera = &self.candidate_cameras[*camera as usize];
+            match bearing_and_weight(camera, pixel, *noise_px) {
+                Some(of_camera) => (bearing, weight) = of_camera,
+                // The candidate intrinsics lost a pixel: no valid state.
+                None => return f64::INFINITY,
+            }
+        }
+        let x = self.candidate_poses[ray.pose as usize].camera_point(point);
+        angular_squared(&bearing, &x) * (weight * weight)
+    }
+
+    fn linearize_block_terms(&self, add: &mut dyn FnMut(usize, &[[f64; 6]; 6], &[f64; 6])) -> f64 {
+        let mut cost = 0.0;
+        for prior in &self.priors {
+            let r = self.prior_residual(prior, &self.poses);
+            let (rho, weight) = prior.loss.evaluate(r.norm_squared());
+            cost += 0.5 * rho;
+            let (mut hessian, mut gradient) = ([[0.0; 6]; 6], [0.0; 6]);
+            for k in 0..3 {
+                hessian[3 + k][3 + k] = weight * prior.inverse_sigma * prior.inverse_sigma;
+                gradient[3 + k] = weight * prior.inverse_sigma * r[k];
+            }
+            add(self.block_of_pose[prior.pose as usize] as usize, &hessian, &gradient);
+        }
+        cost
+    }
+
+    fn block_terms_cost(&self) -> f64 {
+        let cost = |prior: &Prior| {
+            0.5 * prior.loss.evaluate(self.prior_residual(prior, &self.candidate_poses).norm_squared()).0
+        };
+        self.priors.iter().map(cost).sum()
+    }
+
+    fn propose(&mut self, step: &[f64]) -> bool {
+        for (block, &pose) in self.pose_of_block.iter().enumerate() {
+            let step = &step[block * POSE_DIM..(block + 1) * POSE_DIM];
+            let current = &self.poses[pose as usize].world_from_camera;
+            let turn = UnitQuaternion::from_scaled_axis(Vector3::new(step[0], step[1], step[2]));
+            let rotation = UnitQuaternion::new_normalize((current.rotation * turn).into_inner());
+            let translation = current.translation + Vector3::new(step[3], step[4], step[5]);
+            self.candidate_poses[pose as usize] = PoseState::new(Rigid::new(rotation, translation));
+        }
+        let mut next = self.pose_of_block.len() * POSE_DIM;
+        for (camera, parameters) in &self.intrinsics {
+            let (current, candidate) =
+                (&self.cameras[*camera as usize], &mut self.candidate_cameras[*camera as usize]);
+            for &parameter in parameters {
+                candidate.params[parameter] = current.params[parameter] + step[next];
+                next += 1;
+            }
+            let focal = focal_parameters(candidate.model);
+            let sane = candidate.params.iter().all(|value| value.is_finite())
+                && candidate.params[focal].iter().all(|&focal| focal > 0.0);
+            if !sane || candidate.validate().is_err() {
+                return false;
+            }
+        }
+        true
+    }
+
+    fn accept(&mut self) {
+        for &pose in &self.pose_of_block {
+            self.poses[pose as usize] = self.candidate_poses[pose as usize];
+        }
+        for (camera, _) in &self.intrinsics {
+            self.cameras[*camera as usize]
+                .params
+                .copy_from_slice(&self.candidate_cameras[*camera as usize].params);
+        }
+    }
+
+    fn squared_norm(&self) -> f64 {
+        let of_pose =
+            |&pose: &u32| 1.0 + self.poses[pose as usize].world_from_camera.translation.norm_squared();
+        self.pose_of_block.iter().map(of_pose).sum()
+    }
+}
+
+/// Bearing and 1/σ of a pixel, or `None` when they are no finite positive numbers.
+fn bearing_and_weight(camera: &Camera, pixel: &Vector2<f64>, noise_px: f64) -> Option<(Vector3<f64>, f64)> {
+    if !(pixel.x.is_finite() && pixel.y.is_finite() && noise_px.is_finite() && noise_px > 0.0) {
+        return None;
+    }
+    let bearing = camera.unproject(pixel)?;
+    let weight = 1.0 / (camera.pixel_angle(pixel)? * noise_px);
+    (bearing.norm_squared().is_finite() && weight.is_finite() && weight > 0.0).then_some((bearing, weight))
+}
+
+/// Focal lengths within the parameters.
+fn focal_parameters(model: CameraModel) -> std::ops::Range<usize> {
+    match model {
+        CameraModel::Equirectangular => 0..0,
+        CameraModel::Pinhole | CameraModel::Opencv | CameraModel::OpencvFisheye => 0..2,
+        _ => 0..1,
+    }
+}
+
+/// Indices of the parameters that are estimated, ascending.
+fn free_parameters(camera: &Camera, freedom: IntrinsicsFreedom) -> Vec<usize> {
+    if camera.model == CameraModel::Equirectangular {
+        return Vec::new();
+    }
+    let focal = focal_parameters(camera.model);
+    let principal = focal.end..focal.end + 2;
+    let end = camera.params.len().min(MAX_CAMERA_PARAMS);
+    (0..end)
+        .filter(|index| {
+            (focal.contains(index) && freedom.focal)
+                || (principal.contains(index) && freedom.principal_point)
+                || (*index >= principal.end && freedom.distortion)
+        })
+        .collect()
+}
+
+/// A bearing with its derivatives by the intrinsics.
+struct UnprojectJacobian {
+    bearing: Vector3<f64>,
+    /// ∂bearing/∂params, 3×8; columns beyond the model's parameters are zero.
+    d_params: SMatrix<f64, 3, MAX_CAMERA_PARAMS>,
+    pixel_angle: f64,
+    /// ∂ ln(pixel angle)/∂params.
+    d_log_pixel_angle: [f64; MAX_CAMERA_PARAMS],
+}
+
+/// κ and its derivatives by the intrinsics, by central differences.
+fn unproject_with_jacobian(camera: &Camera, pixel: &Vector2<f64>) -> Option<UnprojectJacobian> {
+    let mut result = UnprojectJacobian {
+        bearing: camera.unproject(pixel)?,
+        d_params: SMatrix::zeros(),
+        pixel_angle: camera.pixel_angle(pixel)?,
+        d_log_pixel_angle: [0.0; MAX_CAMERA_PARAMS],
+    };
+    let mut moved = camera.clone();
+    for (index, &value) in camera.params.iter().enumerate().take(MAX_CAMERA_PARAMS) {
+        let h = 1e-6 * value.abs().max(1.0);
+        let mut at = |value: f64| {
+            moved.params[index] = value;
+            Some((moved.unproject(pixel)?, moved.pixel_angle(pixel)?))
+        };
+        if let (Some((after, angle_after)), Some((before, angle_before))) = (at(value + h), at(value - h)) {
+            result.d_params.set_column(index, &((after - before) / (2.0 * h)));
+            result.d_log_pixel_angle[index] = (angle_after / angle_before).ln() / (2.0 * h);
+        }
+        moved.params[index] = value;
+    }
+    Some(result)
+}

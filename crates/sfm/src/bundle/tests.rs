@@ -1,0 +1,392 @@
+use nalgebra::{UnitQuaternion, Vector2, Vector3, Vector6};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use setloc_features::{Camera, CameraModel};
+
+use super::*;
+use crate::{Rigid, Similarity};
+
+fn vector(rng: &mut ChaCha8Rng) -> Vector3<f64> {
+    Vector3::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0))
+}
+
+/// Standard normal, Box–Muller.
+fn normal(rng: &mut ChaCha8Rng) -> f64 {
+    let (a, b): (f64, f64) = (rng.random_range(f64::MIN_POSITIVE..1.0), rng.random());
+    (-2.0 * a.ln()).sqrt() * (std::f64::consts::TAU * b).cos()
+}
+
+fn pinhole() -> Camera {
+    Camera {
+        model: CameraModel::Pinhole,
+        width: 1600,
+        height: 1200,
+        params: vec![900.0, 900.0, 800.0, 600.0],
+    }
+}
+
+/// Panoramas (even poses) in a box of points all around, and pinhole photos (odd poses).
+fn scene(pose_count: usize, point_count: usize, noise_px: f64, seed: u64) -> BundleProblem {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut problem = BundleProblem {
+        cameras: vec![Camera::equirectangular(4096, 2048), pinhole()],
+        ..BundleProblem::default()
+    };
+    for index in 0..pose_count {
+        let rotation = UnitQuaternion::from_scaled_axis(vector(&mut rng) * 0.8);
+        let centre = Vector3::new(index as f64 - pose_count as f64 / 2.0, 0.0, 0.0) + vector(&mut rng) * 0.6;
+        let world_from_camera = Rigid::new(rotation, centre);
+        problem.poses.push(BundlePose { camera: (index % 2) as u32, world_from_camera, fixed: false });
+    }
+    for point in 0..point_count as u32 {
+        let direction = vector(&mut rng).normalize();
+        let position = direction * rng.random_range(6.0..12.0);
+        let before = problem.observations.len();
+        problem.points.push(BundlePoint { position, fixed: false });
+        for (index, pose) in problem.poses.iter().enumerate() {
+            let camera = &problem.cameras[pose.camera as usize];
+            let Some(pixel) = camera.project(&pose.world_from_camera.inverse_transform_point(&position))
+            else {
+                continue;
+            };
+            let (width, height) = (f64::from(camera.width), f64::from(camera.height));
+            // Near the poles a panorama's pixels are no longer square: its noise would not be what is assumed.
+            let (low, high) =
+                if camera.is_panoramic() { (0.3 * height, 0.7 * height) } else { (0.0, height) };
+            if pixel.x < 0.0 || pixel.x >= width || pixel.y < low || pixel.y >= high {
+                continue;
+            }
+            let bearing = camera.unproject(&pixel).unwrap();
+            let sigma = camera.pixel_angle(&pixel).unwrap() * noise_px;
+            let (u, v) = residual::tangent_basis(&bearing);
+            let moved =
+                (bearing + u * (normal(&mut rng) * sigma) + v * (normal(&mut rng) * sigma)).normalize();
+            problem.observations.push(BundleObservation {
+                pose: index as u32,
+                point,
+                pixel: camera.project(&moved).unwrap(),
+                noise_px: if noise_px > 0.0 { noise_px } else { 1.0 },
+            });
+        }
+        // Tracks, not single sightings: what is seen once has its own test.
+        if problem.observations.len() < before + 2 {
+            problem.observations.truncate(before);
+        }
+    }
+    problem
+}
+
+fn perturb(problem: &mut BundleProblem, amount: f64, seed: u64) {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    for pose in problem.poses.iter_mut().filter(|pose| !pose.fixed) {
+        let turn = UnitQuaternion::from_scaled_axis(vector(&mut rng) * amount);
+        pose.world_from_camera.rotation *= turn;
+        pose.world_from_camera.translation += vector(&mut rng) * amount;
+    }
+    for point in problem.points.iter_mut().filter(|point| !point.fixed) {
+        point.position += vector(&mut rng) * (5.0 * amount);
+    }
+}
+
+/// Largest rotation (rad) and centre difference after the similarity that aligns the centres.
+fn largest_error(found: &BundleProblem, truth: &BundleProblem) -> (f64, f64) {
+    let centres = |problem: &BundleProblem| -> Vec<_> {
+        problem.poses.iter().map(|pose| pose.world_from_camera.translation).collect()
+    };
+    let align = Similarity::from_point_pairs(&centres(found), &centres(truth)).unwrap();
+    let mut worst = (0.0_f64, 0.0_f64);
+    for (found, truth) in found.poses.iter().zip(&truth.poses) {
+        let aligned = align.transform_pose(&found.world_from_camera);
+        worst.0 = worst.0.max(aligned.rotation.angle_to(&truth.world_from_camera.rotation));
+        worst.1 = worst.1.max((aligned.translation - truth.world_from_camera.translation).norm());
+    }
+    worst
+}
+
+fn is_seen(problem: &BundleProblem) -> Vec<bool> {
+    let mut seen = vec![false; problem.points.len()];
+    problem.observations.iter().for_each(|observation| seen[observation.point as usize] = true);
+    seen
+}
+
+fn tight() -> BundleParams {
+    BundleParams { function_tolerance: 0.0, parameter_tolerance: 0.0, ..BundleParams::default() }
+}
+
+#[test]
+fn exact_panoramas_and_photos_recover_truth_in_a_free_gauge() {
+    let truth = scene(8, 300, 0.0, 1);
+    let mut problem = truth.clone();
+    perturb(&mut problem, 0.05, 2);
+    let report = solve(&tight(), &mut problem);
+    let (rotation, position) = largest_error(&problem, &truth);
+    assert!(rotation < 1e-9 && position < 1e-9, "{rotation} {position} {report:?}");
+    // The frame stays about where the perturbed start put it.
+    assert!(
+        problem.poses.iter().zip(&truth.poses).all(|(a, b)| {
+            (a.world_from_camera.translation - b.world_from_camera.translation).norm() < 0.2
+        })
+    );
+}
+
+#[test]
+fn every_loss_recovers_truth_from_exact_data() {
+    for loss in [RobustLoss::Huber(2.0), RobustLoss::Cauchy(2.0), RobustLoss::SoftL1(2.0)] {
+        let truth = scene(5, 150, 0.0, 3);
+        let mut problem = truth.clone();
+        perturb(&mut problem, 0.01, 4);
+        let report = solve(&BundleParams { loss, max_iterations: 200, ..tight() }, &mut problem);
+        let (rotation, position) = largest_error(&problem, &truth);
+        assert!(rotation < 1e-8 && position < 1e-8, "{loss:?} {rotation} {position} {report:?}");
+    }
+}
+
+#[test]
+fn robust_loss_withstands_gross_outliers() {
+    let truth = scene(6, 300, 0.0, 5);
+    let mut problem = truth.clone();
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    for observation in problem.observations.iter_mut().step_by(12) {
+        observation.pixel += Vector2::new(rng.random_range(-300.0..300.0), rng.random_range(-300.0..300.0));
+    }
+    perturb(&mut problem, 0.005, 7);
+    let params = BundleParams { loss: RobustLoss::Cauchy(1.0), max_iterations: 100, ..tight() };
+    solve(&params, &mut problem);
+    let (rotation, position) = largest_error(&problem, &truth);
+    assert!(rotation < 1e-3 && position < 5e-3, "{rotation} {position}");
+}
+
+#[test]
+fn cost_per_degree_of_freedom_is_one_under_noise() {
+    let mut problem = scene(8, 500, 0.7, 8);
+    let report = solve(&tight(), &mut problem);
+    // Seven of the unknowns are gauge.
+    let reduced = 2.0 * report.final_cost / (report.degrees_of_freedom + 7) as f64;
+    assert!((0.94..1.06).contains(&reduced), "{reduced}");
+}
+
+#[test]
+fn fixed_poses_and_points_stay_bit_identical_and_hold_the_frame() {
+    let truth = scene(8, 300, 0.0, 9);
+    let mut problem = truth.clone();
+    for pose in &mut problem.poses[..2] {
+        pose.fixed = true;
+    }
+    for point in problem.points.iter_mut().step_by(10) {
+        point.fixed = true;
+    }
+    perturb(&mut problem, 0.05, 10);
+    let start = problem.clone();
+    solve(&tight(), &mut problem);
+    assert_eq!(problem.poses[..2], start.poses[..2]);
+    assert_eq!(problem.cameras, start.cameras);
+    for (found, before) in problem.points.iter().zip(&start.points).filter(|(_, before)| before.fixed) {
+        assert_eq!(found, before);
+    }
+    for (found, truth) in problem.poses.iter().zip(&truth.poses) {
+        assert!((found.world_from_camera.translation - truth.world_from_camera.translation).norm() < 1e-9);
+    }
+    let seen = is_seen(&truth);
+    for (index, (found, truth)) in problem.points.iter().zip(&truth.points).enumerate() {
+        assert!(!seen[index] || (found.position - truth.position).norm() < 1e-7);
+    }
+}
+
+#[test]
+fn poses_alone_are_found_when_all_points_are_fixed() {
+    let truth = scene(4, 60, 0.0, 11);
+    let mut problem = truth.clone();
+    for point in &mut problem.points {
+        point.fixed = true;
+    }
+    perturb(&mut problem, 0.1, 12);
+    solve(&tight(), &mut problem);
+    for (found, truth) in problem.poses.iter().zip(&truth.poses) {
+        let (found, truth) = (&found.world_from_camera, &truth.world_from_camera);
+        assert!((found.translation - truth.translation).norm() < 1e-10);
+        assert!(found.rotation.angle_to(&truth.rotation) < 1e-10);
+    }
+}
+
+#[test]
+fn points_alone_are_found_when_all_poses_are_fixed() {
+    let truth = scene(6, 200, 0.0, 13);
+    let mut problem = truth.clone();
+    for pose in &mut problem.poses {
+        pose.fixed = true;
+    }
+    perturb(&mut problem, 0.05, 14);
+    solve(&tight(), &mut problem);
+    let seen = is_seen(&truth);
+    for (index, (found, truth)) in problem.points.iter().zip(&truth.points).enumerate() {
+        assert!(!seen[index] || (found.position - truth.position).norm() < 1e-7);
+    }
+}
+
+#[test]
+fn shared_focal_length_is_recovered() {
+    let truth = scene(8, 400, 0.0, 15);
+    let mut problem = truth.clone();
+    problem.camera_freedom = vec![IntrinsicsFreedom::LENS, IntrinsicsFreedom::LENS];
+    problem.cameras[1].params[0] = 840.0;
+    problem.cameras[1].params[1] = 850.0;
+    perturb(&mut problem, 0.02, 16);
+    let report = solve(&BundleParams { max_iterations: 200, ..tight() }, &mut problem);
+    let params = &problem.cameras[1].params;
+    assert!((params[0] - 900.0).abs() < 1e-5 && (params[1] - 900.0).abs() < 1e-5, "{params:?} {report:?}");
+    assert_eq!(params[2..], truth.cameras[1].params[2..]);
+    assert_eq!(problem.cameras[0], truth.cameras[0]);
+}
+
+#[test]
+fn principal_point_is_recovered_when_it_is_free() {
+    let truth = scene(8, 400, 0.0, 17);
+    let mut problem = truth.clone();
+    problem.camera_freedom = vec![
+        IntrinsicsFreedom::FIXED,
+        IntrinsicsFreedom { principal_point: true, ..IntrinsicsFreedom::FIXED },
+    ];
+    problem.cameras[1].params[2] += 20.0;
+    problem.cameras[1].params[3] -= 15.0;
+    solve(&BundleParams { max_iterations: 200, ..tight() }, &mut problem);
+    let params = &problem.cameras[1].params;
+    assert!((params[2] - 800.0).abs() < 1e-5 && (params[3] - 600.0).abs() < 1e-5, "{params:?}");
+    assert_eq!(params[..2], truth.cameras[1].params[..2]);
+}
+
+#[test]
+fn position_priors_set_scale_and_place() {
+    let truth = scene(6, 200, 0.0, 18);
+    let mut problem = truth.clone();
+    for (pose, of_truth) in truth.poses.iter().enumerate() {
+        let position = of_truth.world_from_camera.translation;
+        let loss = RobustLoss::Cauchy(3.0);
+        problem.position_priors.push(PositionPrior { pose: pose as u32, position, sigma: 0.5, loss });
+    }
+    perturb(&mut problem, 0.05, 19);
+    solve(&tight(), &mut problem);
+    for (found, truth) in problem.poses.iter().zip(&truth.poses) {
+        let error = (found.world_from_camera.translation - truth.world_from_camera.translation).norm();
+        assert!(error < 1e-6, "{error}");
+    }
+}
+
+#[test]
+fn antipodal_point_is_not_explained() {
+    let mut problem = scene(3, 40, 0.0, 20);
+    for pose in &mut problem.poses {
+        pose.fixed = true;
+    }
+    let centre = problem.poses[0].world_from_camera.translation;
+    let point = &mut problem.points[0];
+    point.position = centre - (point.position - centre);
+    point.fixed = true;
+    problem.observations.retain(|observation| observation.pose == 0 && observation.point == 0);
+    assert_eq!(problem.observations.len(), 1);
+    let report = solve(&BundleParams::default(), &mut problem);
+    assert!(report.initial_cost > 1e6 && report.final_cost.is_finite());
+}
+
+#[test]
+fn odd_input_is_survived_and_counted() {
+    let mut problem = scene(5, 100, 0.3, 21);
+    let good = problem.observations.len();
+    let template = problem.observations[0];
+    let nan = f64::NAN;
+    problem.observations.push(BundleObservation { pixel: Vector2::new(nan, 1.0), ..template });
+    problem.observations.push(BundleObservation { noise_px: 0.0, ..template });
+    problem.observations.push(BundleObservation { pose: 99, ..template });
+    problem.observations.push(BundleObservation { point: 9999, ..template });
+    let lone = problem.points.len() as u32;
+    problem.points.push(BundlePoint { position: Vector3::new(3.0, 2.0, 1.0), fixed: false });
+    problem.observations.push(BundleObservation { point: lone, ..template });
+    problem.points.push(BundlePoint { position: Vector3::new(nan, 2.0, 1.0), fixed: false });
+    problem.observations.push(BundleObservation { point: lone + 1, ..template });
+    // A point in a camera's centre.
+    let position = problem.poses[template.pose as usize].world_from_camera.translation;
+    problem.points.push(BundlePoint { position, fixed: false });
+    problem.observations.push(BundleObservation { point: lone + 2, ..template });
+    problem.observations.push(problem.observations[1]);
+    let report = solve(&BundleParams::default(), &mut problem);
+    assert_eq!((report.observations, report.ignored), (good + 3, 5));
+    assert!(report.final_cost.is_finite());
+    assert!(problem.poses.iter().all(|pose| pose.world_from_camera.translation.norm() < 100.0));
+    assert_eq!(
+        solve(&BundleParams::default(), &mut BundleProblem::default()).termination,
+        Termination::NothingToDo
+    );
+}
+
+#[test]
+fn bytes_do_not_depend_on_the_number_of_threads() {
+    let mut start = scene(12, 1500, 0.5, 22);
+    start.camera_freedom = vec![IntrinsicsFreedom::FIXED, IntrinsicsFreedom::LENS];
+    perturb(&mut start, 0.02, 23);
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let mut problem = start.clone();
+        let report = pool.install(|| solve(&BundleParams::default(), &mut problem));
+        (report, problem)
+    };
+    let one = run(1);
+    assert_eq!(one, run(2));
+    assert_eq!(one, run(3));
+}
+
+#[test]
+fn covariance_predicts_the_errors() {
+    let (mut sum, mut count) = (0.0, 0);
+    for seed in 0..250 {
+        let mut problem = scene(4, 250, 0.8, 1000 + seed);
+        for pose in &mut problem.poses[..2] {
+            pose.fixed = true;
+        }
+        let truth = problem.clone();
+        solve(&tight(), &mut problem);
+        let covariances = covariance(&problem, RobustLoss::Trivial, &[2, 3]).unwrap();
+        for (pose, covariance) in [2, 3].into_iter().zip(&covariances) {
+            let (found, truth) =
+                (&problem.poses[pose].world_from_camera, &truth.poses[pose].world_from_camera);
+            let turn = (truth.rotation.inverse() * found.rotation).scaled_axis();
+            let shift = found.translation - truth.translation;
+            let error = Vector6::new(turn.x, turn.y, turn.z, shift.x, shift.y, shift.z);
+            sum += error.dot(&(covariance.cholesky().unwrap().inverse() * error));
+            count += 6;
+        }
+    }
+    let ratio = sum / f64::from(count);
+    assert!((0.9..1.1).contains(&ratio), "{ratio}");
+}
+
+#[test]
+fn covariance_says_when_the_gauge_is_free() {
+    let mut problem = scene(5, 100, 0.5, 24);
+    assert_eq!(covariance(&problem, RobustLoss::Trivial, &[1]), None);
+    problem.poses[0].fixed = true;
+    assert_eq!(covariance(&problem, RobustLoss::Trivial, &[1]), None, "scale is free");
+    problem.poses[1].fixed = true;
+    let found = covariance(&problem, RobustLoss::Trivial, &[1, 2]).unwrap();
+    assert_eq!(found[0], Matrix6::zeros());
+    assert!(found[1].diagonal().iter().all(|&variance| variance > 0.0));
+    assert_eq!(covariance(&problem, RobustLoss::Trivial, &[77]), None);
+}
+
+#[test]
+fn point_seen_once_changes_no_covariance() {
+    let mut problem = scene(5, 100, 0.5, 25);
+    problem.poses[0].fixed = true;
+    problem.poses[1].fixed = true;
+    let before = covariance(&problem, RobustLoss::Trivial, &[2, 3]).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(26);
+    for _ in 0..50 {
+        let point = problem.points.len() as u32;
+        problem.points.push(BundlePoint { position: vector(&mut rng) * 9.0, fixed: false });
+        let pose = rng.random_range(0..5);
+        let pixel = Vector2::new(rng.random_range(0.0..1600.0), rng.random_range(0.0..1200.0));
+        problem.observations.push(BundleObservation { pose, point, pixel, noise_px: 1.0 });
+    }
+    let after = covariance(&problem, RobustLoss::Trivial, &[2, 3]).unwrap();
+    for (before, after) in before.iter().zip(&after) {
+        assert!((before - after).norm() < 1e-6 * before.norm());
+    }
+}
