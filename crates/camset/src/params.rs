@@ -66,6 +66,8 @@ pub struct SingleParams {
     pub max_error_sigmas: f64,
     /// Besides all matches, those of this many best-supported scene images are tried by themselves.
     pub covisible_images: usize,
+    /// Most samples that RANSAC draws for one hypothesis; fewer give up earlier on photos of other places.
+    pub max_samples: u32,
     /// Search around projections once a pose is known.
     pub guided: GuidedParams,
     /// When the pose may be used.
@@ -78,6 +80,7 @@ impl Default for SingleParams {
             ratio: 0.8,
             max_error_sigmas: 4.0,
             covisible_images: 3,
+            max_samples: 10_000,
             guided: GuidedParams::default(),
             verdict: VerdictParams::default(),
         }

@@ -195,6 +195,8 @@ pub(crate) fn union(first: &[SceneMatch], second: &[SceneMatch]) -> Vec<SceneMat
 }
 
 /// The pose of greatest truncated score over all matches, from all of them and from covisible parts of them.
+///
+/// Focal lengths take the place of the parts where the intrinsics are not known.
 fn best_hypothesis(
     params: &SingleParams,
     scene: &Scene<'_>,
@@ -203,7 +205,9 @@ fn best_hypothesis(
     seed: u64,
 ) -> Option<Hypothesis> {
     let mut subsets = vec![matches.to_vec()];
-    subsets.extend(covisible_subsets(scene.index, matches, params.covisible_images));
+    if photo.camera_fixed {
+        subsets.extend(covisible_subsets(scene.index, matches, params.covisible_images));
+    }
     let cameras: Vec<Camera> = if photo.camera_fixed {
         vec![photo.camera.clone()]
     } else {
@@ -239,7 +243,12 @@ fn estimate(
     let bearings: Vec<Vector3<f64>> = usable.iter().map(|m| rays.rays.bearings[m.feature as usize]).collect();
     let sigmas: Vec<f64> = usable.iter().map(|m| rays.rays.sigmas[m.feature as usize]).collect();
     let points: Vec<Vector3<f64>> = usable.iter().map(|m| index.position(m.point)).collect();
-    let ransac = RansacParams { max_error_sigma: params.max_error_sigmas, ..RansacParams::default() };
+    let ransac = RansacParams {
+        max_error_sigma: params.max_error_sigmas,
+        max_iterations: params.max_samples.max(1),
+        min_iterations: RansacParams::default().min_iterations.min(params.max_samples.max(1)),
+        ..RansacParams::default()
+    };
     estimate_absolute_pose(&ransac, &bearings, &sigmas, &points, seed).map(|found| found.world_from_camera)
 }
 

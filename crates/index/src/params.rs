@@ -21,7 +21,7 @@ pub enum Backend {
 pub struct IndexParams {
     /// Which search to use.
     pub backend: Backend,
-    /// `auto` searches exactly below this number of descriptors.
+    /// `auto` searches exactly below this number of descriptors; above, inverted lists are many times faster.
     pub exact_below: usize,
     /// Share of the exact two nearest points that an approximate search has to find (the paper asks for 0.95).
     pub target_recall: f64,
@@ -37,8 +37,8 @@ impl Default for IndexParams {
     fn default() -> Self {
         Self {
             backend: Backend::Auto,
-            exact_below: 200_000,
-            target_recall: 0.97,
+            exact_below: 20_000,
+            target_recall: 0.98,
             recall_queries: 500,
             max_candidates: 1024,
             seed: 0,
