@@ -6,6 +6,9 @@ use crate::Camera;
 /// Length of one descriptor in bytes (RootSIFT quantized to `u8`).
 pub const DESCRIPTOR_LEN: usize = 128;
 
+/// Euclidean length of a stored descriptor, up to rounding and clipping of single components at 255.
+pub const DESCRIPTOR_NORM: u16 = 512;
+
 /// A detected point of one image.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C)]
@@ -65,7 +68,8 @@ impl ImageFeatures {
     /// Keypoints outside the domain of κ get the zero vector and an infinite standard deviation, so that no
     /// estimator can use them.
     pub fn rays(&self, camera: &Camera) -> Rays {
-        let mut rays = Rays { bearings: Vec::with_capacity(self.len()), sigmas: Vec::with_capacity(self.len()) };
+        let mut rays =
+            Rays { bearings: Vec::with_capacity(self.len()), sigmas: Vec::with_capacity(self.len()) };
         for keypoint in &self.keypoints {
             let pixel = keypoint.pixel();
             match (camera.unproject(&pixel), camera.pixel_angle(&pixel)) {

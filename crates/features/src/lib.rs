@@ -9,7 +9,9 @@ mod error;
 mod features;
 mod matching;
 
-pub use camera::{Camera, CameraModel, MAX_CAMERA_PARAMS};
+pub use camera::{Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole, ProjectJacobian, UnprojectJacobian};
 pub use error::FeatureError;
-pub use features::{DESCRIPTOR_LEN, ImageFeatures, Keypoint, Rays};
-pub use matching::Match;
+pub use features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Keypoint, Rays};
+pub use matching::{
+    DescriptorBlock, GuidedParams, Match, MatchParams, TwoNearest, match_features, match_guided, two_nearest,
+};

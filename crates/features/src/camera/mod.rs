@@ -1,0 +1,227 @@
+mod brown;
+mod equirectangular;
+mod fisheye;
+mod lens;
+mod model;
+mod paper_rectilinear;
+#[cfg(test)]
+mod tests;
+
+use nalgebra::{Matrix2x3, Matrix3x2, SMatrix, Vector2, Vector3};
+use serde::{Deserialize, Serialize};
+
+use crate::FeatureError;
+use lens::{Intrinsics, Lens};
+pub use model::{CameraModel, ParamRole};
+
+/// The most intrinsic parameters any model has.
+pub const MAX_CAMERA_PARAMS: usize = 8;
+
+/// A camera: model, image size and intrinsic parameters.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Camera {
+    /// The projection model.
+    pub model: CameraModel,
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+    /// Intrinsic parameters in COLMAP's order.
+    pub params: Vec<f64>,
+}
+
+/// A pixel and how it moves with the direction and the intrinsic parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ProjectJacobian {
+    /// The projected pixel.
+    pub pixel: Vector2<f64>,
+    /// ∂pixel / ∂direction, 2 × 3, for the direction as given (not normalized).
+    pub d_direction: Matrix2x3<f64>,
+    /// ∂pixel / ∂params, 2 × 8, columns in COLMAP's parameter order; unused columns are zero.
+    pub d_params: SMatrix<f64, 2, MAX_CAMERA_PARAMS>,
+}
+
+/// A unit ray and how it moves with the pixel and the intrinsic parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UnprojectJacobian {
+    /// The unit ray in the camera frame.
+    pub bearing: Vector3<f64>,
+    /// ∂bearing / ∂pixel, 3 × 2; its columns are tangent to the sphere.
+    pub d_pixel: Matrix3x2<f64>,
+    /// ∂bearing / ∂params, 3 × 8, columns in COLMAP's parameter order; unused columns are zero.
+    pub d_params: SMatrix<f64, 3, MAX_CAMERA_PARAMS>,
+}
+
+impl Camera {
+    /// A full panorama of `width` × `height` pixels.
+    pub fn equirectangular(width: u32, height: u32) -> Self {
+        let params = vec![f64::from(width), f64::from(height)];
+        Self { model: CameraModel::Equirectangular, width, height, params }
+    }
+
+    /// A photo of which only a guess of the focal length is known: `SIMPLE_RADIAL`, centred, no distortion yet.
+    ///
+    /// A guessed camera is going to be refined, and real lenses distort; a single radial term costs one unknown
+    /// and takes most of the distortion of phones and action cameras.
+    pub fn from_focal_guess(width: u32, height: u32, focal_px: f64) -> Self {
+        let params = vec![focal_px, f64::from(width) / 2.0, f64::from(height) / 2.0, 0.0];
+        Self { model: CameraModel::SimpleRadial, width, height, params }
+    }
+
+    /// Checks parameter count, finiteness and ranges.
+    ///
+    /// # Errors
+    /// [`FeatureError::InvalidCamera`] with the value at fault.
+    pub fn validate(&self) -> Result<(), FeatureError> {
+        let invalid = |reason: String| Err(FeatureError::InvalidCamera { model: self.model.name(), reason });
+        if self.width == 0 || self.height == 0 {
+            return invalid(format!("image size {} × {}", self.width, self.height));
+        }
+        if !self.model.accepts_num_params(self.params.len()) {
+            return invalid(format!(
+                "expected {} parameters ({}), got {}",
+                self.model.num_params(),
+                self.model.param_names().join(", "),
+                self.params.len()
+            ));
+        }
+        for (&value, (&name, &role)) in
+            self.params.iter().zip(self.model.param_names().iter().zip(self.model.param_roles()))
+        {
+            if !value.is_finite() {
+                return invalid(format!("{name} is {value}"));
+            }
+            if value <= 0.0 && matches!(role, ParamRole::Focal | ParamRole::SphereSize) {
+                return invalid(format!("{name} must be positive, got {value}"));
+            }
+        }
+        Ok(())
+    }
+
+    /// κ: the unit ray in the camera frame through a pixel, or `None` outside the model's domain.
+    ///
+    /// The pixel may lie outside the image; panoramas are periodic in x.
+    pub fn unproject(&self, pixel: &Vector2<f64>) -> Option<Vector3<f64>> {
+        match self.lens() {
+            Some((lens, k)) => lens.undistort(&k.normalize(pixel), &k.distortion),
+            None => equirectangular::unproject(&self.params, pixel),
+        }
+        .filter(|bearing| bearing.iter().all(|value| value.is_finite()))
+    }
+
+    /// κ⁻¹: the pixel of a direction in the camera frame (any length), or `None` where the camera cannot see it.
+    ///
+    /// "Cannot see" is the model's domain, not the image border: the pixel may lie outside the image.
+    pub fn project(&self, direction: &Vector3<f64>) -> Option<Vector2<f64>> {
+        match self.lens() {
+            Some((lens, k)) => lens.distort(direction, &k.distortion).map(|point| k.denormalize(&point)),
+            None => equirectangular::project(&self.params, direction),
+        }
+        .filter(|pixel| pixel.iter().all(|value| value.is_finite()))
+    }
+
+    /// κ⁻¹ with its derivatives; `None` where [`Camera::project`] is, and exactly at a panorama's poles.
+    pub fn project_with_jacobian(&self, direction: &Vector3<f64>) -> Option<ProjectJacobian> {
+        let Some((lens, k)) = self.lens() else {
+            return equirectangular::project_with_jacobian(&self.params, direction);
+        };
+        let distorted = lens.distort_with_jacobian(direction, &k.distortion)?;
+        let pixel = k.denormalize(&distorted.point);
+        if !pixel.iter().all(|value| value.is_finite()) {
+            return None;
+        }
+        let focal = nalgebra::Matrix2::from_diagonal(&k.focal);
+        let mut canonical = SMatrix::<f64, 2, MAX_CAMERA_PARAMS>::zeros();
+        canonical[(0, 0)] = distorted.point.x;
+        canonical[(1, 1)] = distorted.point.y;
+        canonical[(0, 2)] = 1.0;
+        canonical[(1, 3)] = 1.0;
+        canonical.fixed_columns_mut::<4>(4).copy_from(&(focal * distorted.d_distortion));
+        let d_params = self.model.fold_columns(&canonical);
+        Some(ProjectJacobian { pixel, d_direction: focal * distorted.d_direction, d_params })
+    }
+
+    /// κ with its derivatives; `None` where [`Camera::unproject`] is.
+    pub fn unproject_with_jacobian(&self, pixel: &Vector2<f64>) -> Option<UnprojectJacobian> {
+        let Some((lens, k)) = self.lens() else {
+            return equirectangular::unproject_with_jacobian(&self.params, pixel);
+        };
+        let point = k.normalize(pixel);
+        let undistorted = lens.undistort_with_jacobian(&point, &k.distortion)?;
+        if !undistorted.bearing.iter().all(|value| value.is_finite()) {
+            return None;
+        }
+        let d_x = undistorted.d_point.column(0) / k.focal.x;
+        let d_y = undistorted.d_point.column(1) / k.focal.y;
+        let mut canonical = SMatrix::<f64, 3, MAX_CAMERA_PARAMS>::zeros();
+        canonical.set_column(0, &(d_x * -point.x));
+        canonical.set_column(1, &(d_y * -point.y));
+        canonical.set_column(2, &-d_x);
+        canonical.set_column(3, &-d_y);
+        canonical.fixed_columns_mut::<4>(4).copy_from(&undistorted.d_distortion);
+        let d_params = self.model.fold_columns(&canonical);
+        let d_pixel = Matrix3x2::from_columns(&[d_x, d_y]);
+        Some(UnprojectJacobian { bearing: undistorted.bearing, d_pixel, d_params })
+    }
+
+    /// The angle in radians that one pixel spans at this place of the image.
+    ///
+    /// The root mean square over the two pixel axes, so an isotropic pixel error of σ pixels has the angular
+    /// variance `(σ · pixel_angle)²` per tangent axis on average. Near a panorama's poles this falls to 1/√2 of the
+    /// equator's.
+    pub fn pixel_angle(&self, pixel: &Vector2<f64>) -> Option<f64> {
+        if self.model == CameraModel::Equirectangular {
+            return equirectangular::pixel_angle(&self.params, pixel);
+        }
+        self.unproject_with_jacobian(pixel).map(|ray| (ray.d_pixel.norm_squared() / 2.0).sqrt())
+    }
+
+    /// Whether the camera sees the whole sphere (or is a crop of a picture that does).
+    pub fn is_panoramic(&self) -> bool {
+        self.model == CameraModel::Equirectangular
+    }
+
+    /// Whether the left and the right border of the image are neighbours on the sphere.
+    pub fn wraps_around(&self) -> bool {
+        self.is_panoramic() && self.params.first().is_some_and(|&full| full == f64::from(self.width))
+    }
+
+    /// The mean focal length in pixels; for panoramas the pixels per radian at the horizon.
+    pub fn focal_length(&self) -> f64 {
+        match self.lens() {
+            Some((_, k)) => f64::midpoint(k.focal.x, k.focal.y),
+            None => self.params[0] / std::f64::consts::TAU,
+        }
+    }
+
+    /// What each parameter is, in the order of [`Camera::params`].
+    pub fn param_roles(&self) -> &'static [ParamRole] {
+        &self.model.param_roles()[..self.params.len()]
+    }
+
+    fn lens(&self) -> Option<(Lens, Intrinsics)> {
+        let p = self.params.as_slice();
+        Some(match self.model {
+            CameraModel::SimplePinhole => (Lens::Brown, Intrinsics::new(p[0], p[0], p[1], p[2], [0.0; 4])),
+            CameraModel::Pinhole => (Lens::Brown, Intrinsics::new(p[0], p[1], p[2], p[3], [0.0; 4])),
+            CameraModel::SimpleRadial => {
+                (Lens::Brown, Intrinsics::new(p[0], p[0], p[1], p[2], [p[3], 0.0, 0.0, 0.0]))
+            }
+            CameraModel::Radial => {
+                (Lens::Brown, Intrinsics::new(p[0], p[0], p[1], p[2], [p[3], p[4], 0.0, 0.0]))
+            }
+            CameraModel::Opencv => {
+                (Lens::Brown, Intrinsics::new(p[0], p[1], p[2], p[3], [p[4], p[5], p[6], p[7]]))
+            }
+            CameraModel::SimpleFisheye => (Lens::Fisheye, Intrinsics::new(p[0], p[0], p[1], p[2], [0.0; 4])),
+            CameraModel::OpencvFisheye => {
+                (Lens::Fisheye, Intrinsics::new(p[0], p[1], p[2], p[3], [p[4], p[5], p[6], p[7]]))
+            }
+            CameraModel::PaperRectilinear => {
+                (Lens::PaperRectilinear, Intrinsics::new(p[0], p[0], p[1], p[2], [0.0; 4]))
+            }
+            CameraModel::Equirectangular => return None,
+        })
+    }
+}

@@ -1,0 +1,237 @@
+use std::f64::consts::{FRAC_PI_2, PI};
+
+use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
+
+use super::kernel::{TwoNearest, distance2};
+use super::{Match, collect, passes};
+use crate::{ImageFeatures, Rays};
+
+/// How to match two images of known relative pose.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GuidedParams {
+    /// Largest ratio of nearest to second-nearest distance within the band; looser than without a pose, since most
+    /// wrong candidates are gone.
+    pub ratio: f64,
+    /// Largest distance of two descriptors as unit vectors, in (0, √2].
+    pub max_distance: f64,
+    /// Half width in radians of the band about the epipolar great circle.
+    pub max_angle_rad: f64,
+}
+
+impl GuidedParams {
+    /// Changes whenever the same parameters and inputs give other matches.
+    ///
+    /// 1: band about the great circle, ratio and mutual test.
+    pub const VERSION: u32 = 1;
+}
+
+impl Default for GuidedParams {
+    fn default() -> Self {
+        Self { ratio: 0.9, max_distance: 0.8, max_angle_rad: 0.004 }
+    }
+}
+
+/// Most sectors about the epipole.
+const MAX_SECTORS: usize = 2048;
+
+/// Matches again along the epipolar great circles of a known relative pose.
+///
+/// `second_from_first` is the essential matrix with bᵀ E a = 0 for bearings a of the first and b of the second image.
+/// For each keypoint of the first only those of the second within `max_angle_rad` of the plane with normal E a are
+/// candidates; nearest, second nearest (ratio) and mutual tests are taken among candidates. The whole great circle
+/// counts, so that the sign of E does not matter: callers check depth signs afterwards. Degenerate E (zero) gives no
+/// matches. Matches come in the order of the first image's keypoints.
+pub fn match_guided(
+    params: &GuidedParams,
+    first: (&ImageFeatures, &Rays),
+    second: (&ImageFeatures, &Rays),
+    second_from_first: &Matrix3<f64>,
+) -> Vec<Match> {
+    let Some(sectors) = Sectors::new(&second.1.bearings, second_from_first, params.max_angle_rad) else {
+        return Vec::new();
+    };
+    let planes: Vec<Option<Vector3<f64>>> = first
+        .1
+        .bearings
+        .iter()
+        .map(|bearing| (second_from_first * bearing).try_normalize(f64::EPSILON))
+        .collect();
+    let max_sine = params.max_angle_rad.sin();
+    let mut forward = vec![TwoNearest::NONE; first.0.len()];
+    let mut backward = vec![TwoNearest::NONE; second.0.len()];
+    for (index, plane) in planes.iter().enumerate().take(first.0.len()) {
+        let Some(plane) = plane else { continue };
+        let descriptor = first.0.descriptor(index);
+        for &candidate in sectors.candidates(plane) {
+            let bearing = &second.1.bearings[candidate as usize];
+            // Keypoints without a ray have the zero vector, which lies in every plane.
+            if bearing.dot(plane).abs() > max_sine || *bearing == Vector3::zeros() {
+                continue;
+            }
+            let distance2 = distance2(descriptor, second.0.descriptor(candidate as usize));
+            forward[index].offer(candidate, distance2);
+            backward[candidate as usize].offer(index as u32, distance2);
+        }
+    }
+    let accepts = |nearest: &TwoNearest| passes(nearest, params.ratio, params.max_distance);
+    collect(&forward, accepts, |first, second| {
+        let back = &backward[second as usize];
+        back.index == first && accepts(back)
+    })
+}
+
+/// The second image's keypoints by azimuth about its epipole: every epipolar plane contains the epipole, so the
+/// keypoints near one plane are those of nearly one azimuth (modulo π, a plane has two sides).
+struct Sectors {
+    x_axis: Vector3<f64>,
+    y_axis: Vector3<f64>,
+    members: Vec<u32>,
+    starts: Vec<usize>,
+}
+
+impl Sectors {
+    fn new(bearings: &[Vector3<f64>], second_from_first: &Matrix3<f64>, max_angle_rad: f64) -> Option<Self> {
+        let svd = second_from_first.transpose().svd(false, true);
+        let v_t = svd.v_t?;
+        let smallest = svd.singular_values.imin();
+        if svd.singular_values.max() <= 0.0 || !second_from_first.iter().all(|value| value.is_finite()) {
+            return None;
+        }
+        let epipole = v_t.row(smallest).transpose();
+        let helper = Vector3::ith(epipole.iamin(), 1.0);
+        let x_axis = epipole.cross(&helper).normalize();
+        let y_axis = epipole.cross(&x_axis);
+        // Sectors of about the band's width: narrower ones would only list each keypoint more often.
+        let count = ((PI / (2.0 * max_angle_rad.max(1e-6))) as usize).clamp(1, MAX_SECTORS);
+        let max_sine = max_angle_rad.sin();
+        let spans: Vec<(usize, usize)> = bearings
+            .iter()
+            .map(|bearing| {
+                let (x, y) = (bearing.dot(&x_axis), bearing.dot(&y_axis));
+                // sin(deviation) = sin(angle to the epipole) · sin(azimuth difference).
+                let sine = max_sine / x.hypot(y);
+                // A little wider, so that rounding never hides a candidate that the exact test accepts.
+                let half = if sine < 1.0 { sine.asin() + 1e-9 } else { FRAC_PI_2 };
+                if half >= FRAC_PI_2 {
+                    return (0, count);
+                }
+                let azimuth = y.atan2(x).rem_euclid(PI);
+                let width = PI / count as f64;
+                let begin = ((azimuth - half) / width).floor();
+                let end = ((azimuth + half) / width).floor();
+                let len = ((end - begin) as usize + 1).min(count);
+                (begin.rem_euclid(count as f64) as usize % count, len)
+            })
+            .collect();
+        let mut starts = vec![0; count + 1];
+        for &(begin, len) in &spans {
+            (0..len).for_each(|step| starts[(begin + step) % count + 1] += 1);
+        }
+        for sector in 0..count {
+            starts[sector + 1] += starts[sector];
+        }
+        let mut next = starts.clone();
+        let mut members = vec![0; starts[count]];
+        for (index, &(begin, len)) in (0u32..).zip(&spans) {
+            for step in 0..len {
+                let sector = (begin + step) % count;
+                members[next[sector]] = index;
+                next[sector] += 1;
+            }
+        }
+        Some(Self { x_axis, y_axis, members, starts })
+    }
+
+    /// Keypoints that may lie in the band of the plane with this normal, in index order.
+    fn candidates(&self, plane: &Vector3<f64>) -> &[u32] {
+        // The plane's azimuth is a quarter turn from its normal's.
+        let azimuth = plane.dot(&self.x_axis).atan2(-plane.dot(&self.y_axis)).rem_euclid(PI);
+        let count = self.starts.len() - 1;
+        let sector = ((azimuth / PI * count as f64) as usize).min(count - 1);
+        &self.members[self.starts[sector]..self.starts[sector + 1]]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Rotation3;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::{DESCRIPTOR_LEN, Keypoint};
+
+    struct Pair {
+        first: (ImageFeatures, Rays),
+        second: (ImageFeatures, Rays),
+        essential: Matrix3<f64>,
+    }
+
+    /// Points all round two panoramas; every descriptor occurs twice, at different places.
+    fn pair() -> Pair {
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        let rotation = Rotation3::from_euler_angles(0.2, 1.1, -0.4);
+        let translation = Vector3::new(0.5, -0.1, 0.7);
+        let mut rays = (Rays::default(), Rays::default());
+        let mut descriptors = Vec::new();
+        for index in 0..400 {
+            let point = Vector3::from_fn(|_, _| rng.random_range(-5.0..5.0));
+            rays.0.bearings.push(point.normalize());
+            rays.1.bearings.push((rotation * point + translation).normalize());
+            let descriptor: Vec<u8> = if index % 2 == 0 {
+                (0..DESCRIPTOR_LEN).map(|_| rng.random_range(0..90)).collect()
+            } else {
+                descriptors[descriptors.len() - DESCRIPTOR_LEN..].to_vec()
+            };
+            descriptors.extend(descriptor);
+        }
+        let keypoints: Vec<Keypoint> = vec![bytemuck::Zeroable::zeroed(); 400];
+        let features = ImageFeatures { keypoints, descriptors, ..ImageFeatures::default() };
+        let essential = translation.cross_matrix() * rotation.matrix();
+        Pair { first: (features.clone(), rays.0), second: (features, rays.1), essential }
+    }
+
+    #[test]
+    fn geometry_tells_repeated_descriptors_apart() {
+        let pair = pair();
+        let params = GuidedParams { max_angle_rad: 0.002, ..GuidedParams::default() };
+        let matches = match_guided(
+            &params,
+            (&pair.first.0, &pair.first.1),
+            (&pair.second.0, &pair.second.1),
+            &pair.essential,
+        );
+        assert!(matches.len() > 370, "{}", matches.len());
+        assert!(matches.iter().all(|found| found.first == found.second));
+    }
+
+    #[test]
+    fn sectors_hide_no_candidate_of_the_band() {
+        let pair = pair();
+        for max_angle in [1e-4_f64, 0.01, 0.3, 1.5] {
+            let bearings = &pair.second.1.bearings;
+            let sectors = Sectors::new(bearings, &pair.essential, max_angle).unwrap();
+            for bearing in &pair.first.1.bearings {
+                let plane = (pair.essential * bearing).normalize();
+                let listed = sectors.candidates(&plane);
+                for (index, other) in (0u32..).zip(bearings) {
+                    if other.dot(&plane).abs() <= max_angle.sin() {
+                        assert!(listed.contains(&index), "angle {max_angle}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_zero_matrix_or_empty_images_give_no_matches() {
+        let pair = pair();
+        let params = GuidedParams::default();
+        let first = (&pair.first.0, &pair.first.1);
+        assert!(match_guided(&params, first, first, &Matrix3::zeros()).is_empty());
+        let none = (ImageFeatures::default(), Rays::default());
+        assert!(match_guided(&params, first, (&none.0, &none.1), &pair.essential).is_empty());
+    }
+}

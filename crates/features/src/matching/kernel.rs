@@ -1,0 +1,352 @@
+//! Exact two nearest neighbours of u8 descriptors by blocked integer products.
+//!
+//! ‖q − b‖² = ‖q‖² + ‖b‖² − 2 q·b, so the work is one integer matrix product. Base descriptors are packed so that one
+//! vector register holds the same few components of 8 or 16 descriptors; a register tile of queries × base vectors
+//! runs over all 128 components, then each finished tile updates the best two of its rows (queries) and, for mutual
+//! matching, of its columns (base) in the same pass. A comparison with the second-best distances skips nearly all
+//! updates, so the product dominates.
+
+use bytemuck::{Pod, Zeroable};
+
+use super::{avx2, avx512, count};
+use crate::DESCRIPTOR_LEN;
+
+/// Distance of a slot that has seen nothing: above every real squared distance (128 · 255² < 2²³).
+pub(super) const UNSEEN: i32 = 1 << 28;
+/// Term of a padding row or column: lifts it above [`UNSEEN`].
+pub(super) const PADDING: i32 = 1 << 29;
+
+/// The nearest descriptor and the distances of the nearest two.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TwoNearest {
+    /// Index of the nearest descriptor, the lowest of equally near ones; [`TwoNearest::NO_INDEX`] if there is none.
+    pub index: u32,
+    /// Squared Euclidean distance of the stored bytes; [`TwoNearest::NO_DISTANCE`] if there is none.
+    pub distance2: u32,
+    /// Squared distance of the second nearest; [`TwoNearest::NO_DISTANCE`] if there are fewer than two.
+    pub second_distance2: u32,
+}
+
+impl TwoNearest {
+    /// Marks the absence of a neighbour.
+    pub const NO_INDEX: u32 = u32::MAX;
+    /// Marks the absence of a distance.
+    pub const NO_DISTANCE: u32 = u32::MAX;
+    /// No neighbour seen yet.
+    pub const NONE: Self =
+        Self { index: Self::NO_INDEX, distance2: Self::NO_DISTANCE, second_distance2: Self::NO_DISTANCE };
+
+    /// Takes the nearest two of both; at equal distance `self` wins, so merge in ascending index order.
+    pub fn merge(&mut self, other: &Self) {
+        if other.distance2 < self.distance2 {
+            self.second_distance2 = self.distance2.min(other.second_distance2);
+            self.distance2 = other.distance2;
+            self.index = other.index;
+        } else {
+            self.second_distance2 = self.second_distance2.min(other.distance2);
+        }
+    }
+
+    /// Offers one more candidate; at equal distance the earlier one stays.
+    pub fn offer(&mut self, index: u32, distance2: u32) {
+        if distance2 < self.distance2 {
+            self.second_distance2 = self.distance2;
+            self.distance2 = distance2;
+            self.index = index;
+        } else {
+            self.second_distance2 = self.second_distance2.min(distance2);
+        }
+    }
+}
+
+/// Which instructions to use; all give identical results.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kernel {
+    Scalar,
+    Avx2,
+    Avx512,
+}
+
+impl Kernel {
+    pub fn detect() -> Self {
+        if avx512::is_available() {
+            Self::Avx512
+        } else if avx2::is_available() {
+            Self::Avx2
+        } else {
+            Self::Scalar
+        }
+    }
+}
+
+/// Sixty-four bytes on a cache line of their own, so that no vector load straddles two.
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+#[repr(C, align(64))]
+pub(super) struct Line(pub [u8; 64]);
+
+/// Base descriptors packed for one kernel.
+pub(super) struct PackedBase {
+    pub lines: Vec<Line>,
+    /// What each column adds to the squared distance, padded to whole tiles.
+    pub terms: Vec<i32>,
+}
+
+/// Query descriptors packed for one kernel.
+pub(super) struct PackedQueries {
+    pub lines: Vec<Line>,
+    /// What each row adds to the squared distance, padded to whole tiles.
+    pub terms: Vec<i32>,
+}
+
+/// Best two per row or column, as parallel arrays; padding entries are never updated.
+pub(super) struct Slots {
+    pub best: Vec<i32>,
+    pub second: Vec<i32>,
+    pub index: Vec<u32>,
+}
+
+impl Slots {
+    fn new(len: usize, padded: usize) -> Self {
+        let mut second = vec![UNSEEN; len];
+        second.resize(padded, i32::MIN);
+        Self { best: vec![UNSEEN; padded], second, index: vec![TwoNearest::NO_INDEX; padded] }
+    }
+
+    #[inline(always)]
+    pub fn update(&mut self, slot: usize, distance2: i32, index: usize) {
+        if distance2 < self.best[slot] {
+            self.second[slot] = self.best[slot];
+            self.best[slot] = distance2;
+            self.index[slot] = index as u32;
+        } else if distance2 < self.second[slot] {
+            self.second[slot] = distance2;
+        }
+    }
+
+    fn finish(&self, len: usize) -> Vec<TwoNearest> {
+        let distance = |value: i32| if value == UNSEEN { TwoNearest::NO_DISTANCE } else { value as u32 };
+        (0..len)
+            .map(|slot| TwoNearest {
+                index: self.index[slot],
+                distance2: distance(self.best[slot]),
+                second_distance2: distance(self.second[slot]),
+            })
+            .collect()
+    }
+}
+
+/// Descriptors packed once for many searches, as the lists of an inverted index are.
+///
+/// ```
+/// use setloc_features::{DESCRIPTOR_LEN, DescriptorBlock, TwoNearest};
+///
+/// let list = DescriptorBlock::new(&[vec![10; DESCRIPTOR_LEN], vec![20; DESCRIPTOR_LEN]].concat());
+/// let query = vec![11; DESCRIPTOR_LEN];
+/// // This list's descriptors are numbers 500 and 501 of the whole index.
+/// let mut nearest = [TwoNearest::NONE];
+/// list.update(&query, 500, &mut nearest);
+/// assert_eq!(nearest[0], TwoNearest { index: 500, distance2: 128, second_distance2: 128 * 81 });
+/// ```
+pub struct DescriptorBlock {
+    kernel: Kernel,
+    len: usize,
+    base: PackedBase,
+}
+
+impl std::fmt::Debug for DescriptorBlock {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.debug_struct("DescriptorBlock").field("kernel", &self.kernel).field("len", &self.len).finish()
+    }
+}
+
+impl DescriptorBlock {
+    /// Packs row-major descriptors, `n × DESCRIPTOR_LEN` bytes.
+    pub fn new(descriptors: &[u8]) -> Self {
+        Self::with_kernel(Kernel::detect(), descriptors)
+    }
+
+    fn with_kernel(kernel: Kernel, descriptors: &[u8]) -> Self {
+        let base = match kernel {
+            Kernel::Scalar => pack_scalar(descriptors),
+            Kernel::Avx2 => avx2::pack_base(descriptors),
+            Kernel::Avx512 => avx512::pack_base(descriptors),
+        };
+        Self { kernel, len: count(descriptors), base }
+    }
+
+    /// Number of descriptors.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether the block has no descriptors.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The nearest two of each query (row-major, `n × DESCRIPTOR_LEN` bytes), indices counted within the block.
+    pub fn two_nearest(&self, queries: &[u8]) -> Vec<TwoNearest> {
+        self.search(queries, false).0
+    }
+
+    /// Merges the nearest two of each query into `nearest`, with this block's descriptors numbered from `first_index`.
+    ///
+    /// Give blocks in ascending order of `first_index` for ties to go to the lowest index. `nearest` beyond the
+    /// number of queries is left alone.
+    pub fn update(&self, queries: &[u8], first_index: u32, nearest: &mut [TwoNearest]) {
+        for (slot, mut found) in nearest.iter_mut().zip(self.two_nearest(queries)) {
+            if found.index != TwoNearest::NO_INDEX {
+                found.index += first_index;
+            }
+            slot.merge(&found);
+        }
+    }
+
+    fn search(&self, queries: &[u8], both: bool) -> (Vec<TwoNearest>, Vec<TwoNearest>) {
+        let num_queries = count(queries);
+        let packed = match self.kernel {
+            Kernel::Scalar => pack_queries_scalar(queries),
+            Kernel::Avx2 => avx2::pack_queries(queries),
+            Kernel::Avx512 => avx512::pack_queries(queries),
+        };
+        let mut rows = Slots::new(num_queries, packed.terms.len());
+        let mut columns = Slots::new(self.len, self.base.terms.len());
+        match self.kernel {
+            Kernel::Scalar => search_scalar(&packed, &self.base, &mut rows, &mut columns),
+            Kernel::Avx2 => avx2::search(&packed, &self.base, &mut rows, &mut columns, both),
+            Kernel::Avx512 => avx512::search(&packed, &self.base, &mut rows, &mut columns, both),
+        }
+        (rows.finish(num_queries), if both { columns.finish(self.len) } else { Vec::new() })
+    }
+}
+
+/// The two nearest of `base` for each of `queries` (both row-major, `n × DESCRIPTOR_LEN` bytes).
+pub fn two_nearest(queries: &[u8], base: &[u8]) -> Vec<TwoNearest> {
+    DescriptorBlock::new(base).two_nearest(queries)
+}
+
+/// Both directions in one pass: for each query its nearest two of `base`, for each of `base` its nearest two queries.
+pub(super) fn two_nearest_both(queries: &[u8], base: &[u8]) -> (Vec<TwoNearest>, Vec<TwoNearest>) {
+    DescriptorBlock::new(base).search(queries, true)
+}
+
+pub(super) fn squared_norm(descriptor: &[u8]) -> i32 {
+    descriptor.iter().map(|&value| i32::from(value) * i32::from(value)).sum()
+}
+
+/// Squared distance of two descriptors.
+#[inline(always)]
+pub(super) fn distance2(first: &[u8], second: &[u8]) -> u32 {
+    first.iter().zip(second).map(|(&a, &b)| (i32::from(a) - i32::from(b)).pow(2)).sum::<i32>() as u32
+}
+
+fn lines_of(bytes: &[u8]) -> Vec<Line> {
+    bytes.chunks_exact(64).map(bytemuck::pod_read_unaligned).collect()
+}
+
+fn terms_of(descriptors: &[u8]) -> Vec<i32> {
+    descriptors.chunks_exact(DESCRIPTOR_LEN).map(squared_norm).collect()
+}
+
+fn pack_scalar(descriptors: &[u8]) -> PackedBase {
+    PackedBase { lines: lines_of(descriptors), terms: terms_of(descriptors) }
+}
+
+fn pack_queries_scalar(descriptors: &[u8]) -> PackedQueries {
+    PackedQueries { lines: lines_of(descriptors), terms: terms_of(descriptors) }
+}
+
+fn search_scalar(queries: &PackedQueries, base: &PackedBase, rows: &mut Slots, columns: &mut Slots) {
+    let base_bytes: &[u8] = bytemuck::cast_slice(&base.lines);
+    let query_bytes: &[u8] = bytemuck::cast_slice(&queries.lines);
+    for (row, query) in query_bytes.chunks_exact(DESCRIPTOR_LEN).enumerate() {
+        for (column, candidate) in base_bytes.chunks_exact(DESCRIPTOR_LEN).enumerate() {
+            let product: i32 =
+                query.iter().zip(candidate).map(|(&a, &b)| i32::from(a) * i32::from(b)).sum();
+            let distance2 = queries.terms[row] + base.terms[column] - 2 * product;
+            rows.update(row, distance2, column);
+            columns.update(column, distance2, row);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    fn kernels() -> Vec<Kernel> {
+        let mut kernels = vec![Kernel::Scalar];
+        if avx2::is_available() {
+            kernels.push(Kernel::Avx2);
+        }
+        if avx512::is_available() {
+            kernels.push(Kernel::Avx512);
+        }
+        kernels
+    }
+
+    fn naive(queries: &[u8], base: &[u8]) -> Vec<TwoNearest> {
+        queries
+            .chunks_exact(DESCRIPTOR_LEN)
+            .map(|query| {
+                let mut nearest = TwoNearest::NONE;
+                for (index, candidate) in base.chunks_exact(DESCRIPTOR_LEN).enumerate() {
+                    nearest.offer(index as u32, distance2(query, candidate));
+                }
+                nearest
+            })
+            .collect()
+    }
+
+    #[test]
+    fn all_kernels_agree_with_the_definition_at_every_remainder() {
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        // Few distinct values make ties common; the full range tests the arithmetic's limits.
+        for top in [2u8, 255] {
+            for (num_queries, num_base) in
+                [(1, 1), (1, 2), (5, 15), (12, 32), (13, 33), (7, 129), (25, 64), (61, 290), (3, 0), (0, 3)]
+            {
+                let mut random = |count: usize| -> Vec<u8> {
+                    (0..count * DESCRIPTOR_LEN).map(|_| rng.random_range(0..=top)).collect()
+                };
+                let (queries, base) = (random(num_queries), random(num_base));
+                for kernel in kernels() {
+                    let (rows, columns) = DescriptorBlock::with_kernel(kernel, &base).search(&queries, true);
+                    assert_eq!(rows, naive(&queries, &base), "{kernel:?} {num_queries} × {num_base}");
+                    assert_eq!(columns, naive(&base, &queries), "{kernel:?} {num_queries} × {num_base}");
+                    let one_way = DescriptorBlock::with_kernel(kernel, &base).two_nearest(&queries);
+                    assert_eq!(rows, one_way);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn extreme_bytes_neither_saturate_nor_overflow() {
+        let queries = [vec![255; DESCRIPTOR_LEN], vec![0; DESCRIPTOR_LEN]].concat();
+        let base = [vec![0; DESCRIPTOR_LEN], vec![254; DESCRIPTOR_LEN]].concat();
+        for kernel in kernels() {
+            let nearest = DescriptorBlock::with_kernel(kernel, &base).two_nearest(&queries);
+            let far = 128 * 255 * 255;
+            assert_eq!(nearest[0], TwoNearest { index: 1, distance2: 128, second_distance2: far });
+            assert_eq!(nearest[1], TwoNearest { index: 0, distance2: 0, second_distance2: 128 * 254 * 254 });
+        }
+    }
+
+    #[test]
+    fn merging_blocks_equals_searching_the_whole() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let mut random = |count: usize| -> Vec<u8> {
+            (0..count * DESCRIPTOR_LEN).map(|_| rng.random_range(0..=3)).collect()
+        };
+        let (queries, base) = (random(20), random(100));
+        let mut merged = vec![TwoNearest::NONE; 20];
+        let (head, tail) = base.split_at(37 * DESCRIPTOR_LEN);
+        DescriptorBlock::new(head).update(&queries, 0, &mut merged);
+        DescriptorBlock::new(tail).update(&queries, 37, &mut merged);
+        assert_eq!(merged, two_nearest(&queries, &base));
+    }
+}

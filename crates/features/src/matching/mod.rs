@@ -1,0 +1,190 @@
+mod avx2;
+mod avx512;
+mod guided;
+mod kernel;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, FeatureError, ImageFeatures};
+pub use guided::{GuidedParams, match_guided};
+pub use kernel::{DescriptorBlock, TwoNearest, two_nearest};
+
+/// A putative or verified match: keypoint `first` of one image shows what keypoint `second` of another shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
+pub struct Match {
+    /// Keypoint index in the first image.
+    pub first: u32,
+    /// Keypoint index in the second image.
+    pub second: u32,
+}
+
+/// How to match two images.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MatchParams {
+    /// Largest ratio of the nearest to the second-nearest descriptor distance, in (0, 1]; lower is stricter.
+    pub ratio: f64,
+    /// Whether each keypoint must also be the other's nearest.
+    pub mutual: bool,
+    /// Largest distance of two descriptors as unit vectors, in (0, √2]: √2 is orthogonal, so no limit.
+    pub max_distance: f64,
+}
+
+impl MatchParams {
+    /// Changes whenever the same parameters and features give other matches.
+    ///
+    /// 1: exact two nearest neighbours, ratio and mutual test.
+    pub const VERSION: u32 = 1;
+
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// [`FeatureError::InvalidParameter`] with the value at fault.
+    pub fn validate(&self) -> Result<(), FeatureError> {
+        crate::error::check("ratio", self.ratio, "in (0, 1]", self.ratio > 0.0 && self.ratio <= 1.0)?;
+        let in_range = self.max_distance > 0.0 && self.max_distance <= std::f64::consts::SQRT_2 + 1e-9;
+        crate::error::check("max_distance", self.max_distance, "in (0, sqrt 2]", in_range)
+    }
+
+    /// The ratio and distance tests on squared distances of stored descriptors.
+    fn accepts(&self, nearest: &TwoNearest) -> bool {
+        passes(nearest, self.ratio, self.max_distance)
+    }
+}
+
+impl Default for MatchParams {
+    fn default() -> Self {
+        Self { ratio: 0.8, mutual: true, max_distance: 1.0 }
+    }
+}
+
+fn passes(nearest: &TwoNearest, ratio: f64, max_distance: f64) -> bool {
+    let limit = max_distance * f64::from(DESCRIPTOR_NORM);
+    let distance2 = f64::from(nearest.distance2);
+    nearest.index != TwoNearest::NO_INDEX
+        && distance2 <= limit * limit
+        // A lone candidate has no second to be confused with.
+        && (nearest.second_distance2 == TwoNearest::NO_DISTANCE
+            || distance2 < ratio * ratio * f64::from(nearest.second_distance2))
+}
+
+/// Matches two images by exact two-nearest-neighbour search, ratio test and mutual test.
+///
+/// Distances are exact integers and ties go to the lower index, so the result is the same on every processor. With
+/// `mutual` both images' keypoints must pass the ratio test. Single-threaded: callers work on many pairs in parallel.
+/// Matches come in the order of the first image's keypoints.
+pub fn match_features(params: &MatchParams, first: &ImageFeatures, second: &ImageFeatures) -> Vec<Match> {
+    if first.is_empty() || second.is_empty() {
+        return Vec::new();
+    }
+    if !params.mutual {
+        let nearest = two_nearest(&first.descriptors, &second.descriptors);
+        return collect(&nearest, |nearest| params.accepts(nearest), |_, _| true);
+    }
+    let (forward, backward) = kernel::two_nearest_both(&first.descriptors, &second.descriptors);
+    collect(
+        &forward,
+        |nearest| params.accepts(nearest),
+        |first, second| {
+            let back = &backward[second as usize];
+            back.index == first && params.accepts(back)
+        },
+    )
+}
+
+fn collect(
+    nearest: &[TwoNearest],
+    accepts: impl Fn(&TwoNearest) -> bool,
+    agrees: impl Fn(u32, u32) -> bool,
+) -> Vec<Match> {
+    (0u32..)
+        .zip(nearest)
+        .filter(|(first, nearest)| accepts(nearest) && agrees(*first, nearest.index))
+        .map(|(first, nearest)| Match { first, second: nearest.index })
+        .collect()
+}
+
+/// Number of descriptors in a row-major array.
+fn count(descriptors: &[u8]) -> usize {
+    debug_assert_eq!(descriptors.len() % DESCRIPTOR_LEN, 0);
+    descriptors.len() / DESCRIPTOR_LEN
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    fn features(descriptors: Vec<u8>) -> ImageFeatures {
+        let keypoints = vec![bytemuck::Zeroable::zeroed(); count(&descriptors)];
+        ImageFeatures { keypoints, descriptors, ..ImageFeatures::default() }
+    }
+
+    fn random(rng: &mut ChaCha8Rng, count: usize) -> Vec<u8> {
+        (0..count * DESCRIPTOR_LEN).map(|_| rng.random_range(0..90)).collect()
+    }
+
+    #[test]
+    fn finds_noisy_copies_and_nothing_else() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let first = random(&mut rng, 300);
+        let mut second = random(&mut rng, 200);
+        for index in 0..100 {
+            let copy = &first[index * DESCRIPTOR_LEN..(index + 1) * DESCRIPTOR_LEN];
+            for (target, &value) in
+                second[(199 - index) * DESCRIPTOR_LEN..(200 - index) * DESCRIPTOR_LEN].iter_mut().zip(copy)
+            {
+                *target = value.saturating_add(rng.random_range(0..6));
+            }
+        }
+        let matches = match_features(&MatchParams::default(), &features(first), &features(second));
+        let expected: Vec<Match> = (0..100).map(|first| Match { first, second: 199 - first }).collect();
+        assert_eq!(matches, expected);
+    }
+
+    #[test]
+    fn repeated_structure_fails_the_ratio_test() {
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        let first = random(&mut rng, 1);
+        let second = [first.clone(), first.clone()].concat();
+        let matches = match_features(&MatchParams::default(), &features(first.clone()), &features(second));
+        assert!(matches.is_empty());
+        let alone = match_features(&MatchParams::default(), &features(first.clone()), &features(first));
+        assert_eq!(alone, [Match { first: 0, second: 0 }]);
+    }
+
+    #[test]
+    fn mutual_test_drops_all_but_the_nearest_of_several() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let base = random(&mut rng, 1);
+        let mut near = base.clone();
+        near[0] += 1;
+        let mut far = base.clone();
+        far[..40].iter_mut().for_each(|value| *value += 20);
+        let first = features([far, near].concat());
+        let second = features([base, random(&mut rng, 5)].concat());
+        let with = |mutual| {
+            match_features(&MatchParams { mutual, ..MatchParams::default() }, &first, &second)
+        };
+        assert_eq!(with(true), [Match { first: 1, second: 0 }]);
+        assert_eq!(with(false), [Match { first: 0, second: 0 }, Match { first: 1, second: 0 }]);
+    }
+
+    #[test]
+    fn empty_images_match_nothing() {
+        let some = features(vec![7; DESCRIPTOR_LEN]);
+        let none = ImageFeatures::default();
+        assert!(match_features(&MatchParams::default(), &some, &none).is_empty());
+        assert!(match_features(&MatchParams::default(), &none, &some).is_empty());
+    }
+
+    #[test]
+    fn parameters_out_of_range_are_named() {
+        let error = MatchParams { ratio: 1.5, ..MatchParams::default() }.validate().unwrap_err();
+        assert_eq!(error.to_string(), "ratio is 1.5, expected in (0, 1]");
+        assert!(MatchParams { max_distance: f64::NAN, ..MatchParams::default() }.validate().is_err());
+    }
+}
