@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{Matrix6, Vector3};
-use setloc_features::{Camera, CameraModel};
+use setloc_features::{Camera, ParamRole};
 use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::robust::{RansacParams, estimate_absolute_pose};
 use setloc_sfm::{ImageId, Rigid};
@@ -305,12 +305,11 @@ fn covisible_subsets(index: &SceneIndex, matches: &[SceneMatch], count: usize) -
 /// The camera with its focal length (or lengths) multiplied.
 fn with_focal_factor(camera: &Camera, factor: f64) -> Camera {
     let mut scaled = camera.clone();
-    let focal_lengths = match camera.model {
-        CameraModel::Equirectangular => 0,
-        CameraModel::Pinhole | CameraModel::Opencv | CameraModel::OpencvFisheye => 2,
-        _ => 1,
-    };
-    scaled.params.iter_mut().take(focal_lengths).for_each(|focal| *focal *= factor);
+    for (value, role) in scaled.params.iter_mut().zip(camera.param_roles()) {
+        if *role == ParamRole::Focal {
+            *value *= factor;
+        }
+    }
     scaled
 }
 
