@@ -246,6 +246,20 @@ mod tests {
     }
 
     #[test]
+    fn photos_of_the_same_details_in_another_arrangement_are_not_localized() {
+        let world = World::chain(5, 0.2, 5);
+        for seed in 0..4 {
+            let elsewhere = World::chain_in(&Place::street(3500, 5).shuffled(seed), 5, 0.2, 300 + seed);
+            let local = std::slice::from_ref(&elsewhere.local);
+            let found =
+                locate_set(&CamsetParams::default(), &world.scene(), &elsewhere.queries(), local, seed);
+            for photo in found.rigid.iter().chain(&found.refined) {
+                assert_ne!(photo.verdict, Verdict::Localized, "{seed}: {photo:#?}");
+            }
+        }
+    }
+
+    #[test]
     fn two_equal_places_leave_a_set_uncertain() {
         let place = Place::street(3500, 6);
         let poses: Vec<_> =

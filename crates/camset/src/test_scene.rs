@@ -49,6 +49,15 @@ impl Place {
         Self { positions, descriptors }
     }
 
+    /// Another place of the same details: every point looks like some point of this place, at random.
+    pub(crate) fn shuffled(mut self, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        for i in (1..self.descriptors.len()).rev() {
+            self.descriptors.swap(i, rng.random_range(0..=i));
+        }
+        self
+    }
+
     /// Renders one view: `outliers` is the share of features that look like other points, `change` the illumination's
     /// effect on descriptors.
     pub(crate) fn view(&self, camera: &Camera, pose: Rigid, outliers: f64, change: i16, seed: u64) -> View {
@@ -145,7 +154,10 @@ pub(crate) fn along_street(center: Vector3<f64>, yaw: f64) -> Rigid {
 impl World {
     /// The usual world: eight panoramas, then photos every six units from z = 20 on.
     pub(crate) fn chain(photos: usize, outliers: f64, seed: u64) -> Self {
-        let place = Place::street(3500, seed);
+        Self::chain_in(&Place::street(3500, seed), photos, outliers, seed)
+    }
+
+    pub(crate) fn chain_in(place: &Place, photos: usize, outliers: f64, seed: u64) -> Self {
         let poses: Vec<Rigid> = (0..photos)
             .map(|i| {
                 along_street(
@@ -154,7 +166,7 @@ impl World {
                 )
             })
             .collect();
-        Self::new(&place, &poses, outliers, seed)
+        Self::new(place, &poses, outliers, seed)
     }
 
     pub(crate) fn new(place: &Place, poses: &[Rigid], outliers: f64, seed: u64) -> Self {
