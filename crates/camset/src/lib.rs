@@ -1,109 +1,36 @@
 //! Pose of one photo, or of a whole image set as one generalized camera, in a scene.
+//!
+//! A photo alone needs matches of its own ([`locate_single`]). A set ([`locate_set`]) needs them only somewhere: its
+//! local model ties all photos together, the scene ties the model down, and a joint refinement lets the photos move
+//! against each other, because a local model drifts. Whatever comes out is an answer with its evidence, never an
+//! error: a verdict, a covariance, what the data leave undetermined, and the weakest link on the way from the scene.
+//!
+//! The one decision that shapes this crate: *verdicts are separate from poses*. A pose is the best explanation
+//! found; whether it may be used is decided afterwards from evidence that the estimation did not create (matches
+//! before guided matching, the runner-up hypothesis, the covariance, the chain of links).
+//!
+//! It knows no files and no features beyond those handed in, and it builds no local models.
 
-use nalgebra::Matrix6;
-use serde::{Deserialize, Serialize};
-use setloc_features::{Camera, ImageFeatures};
-use setloc_index::SceneIndex;
-use setloc_sfm::{Reconstruction, Rigid, Similarity};
+mod advice;
+mod evidence;
+mod guided;
+mod observability;
+mod params;
+mod refine;
+mod set;
+mod single;
+#[cfg(test)]
+mod test_scene;
+mod types;
+mod verdict;
 
-/// A built scene, borrowed.
-#[derive(Debug, Clone, Copy)]
-pub struct Scene<'a> {
-    /// The scene's model (its largest component).
-    pub reconstruction: &'a Reconstruction,
-    /// Its searchable descriptors.
-    pub index: &'a SceneIndex,
-}
+pub use advice::{Link, PathToScene};
+pub use params::{CamsetMethod, CamsetParams, GuidedParams, SingleParams, VerdictParams};
+pub use set::locate_set;
+pub use single::locate_single;
+pub use types::{PhotoLocalization, QueryPhoto, Scene, SetLocalization, Verdict};
 
-/// One photo to localize.
-#[derive(Debug, Clone, Copy)]
-pub struct QueryPhoto<'a> {
-    /// Name as the user knows it.
-    pub name: &'a str,
-    /// Its camera; a guess when `camera_fixed` is false.
-    pub camera: &'a Camera,
-    /// Whether the intrinsics are known.
-    pub camera_fixed: bool,
-    /// Its features.
-    pub features: &'a ImageFeatures,
-}
-
-/// The answer in one word.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Verdict {
-    /// The pose is supported well enough to be used.
-    Localized,
-    /// There is a pose, but it may be wrong or imprecise; the reasons say why.
-    Uncertain,
-    /// There is no pose.
-    NotLocalized,
-}
-
-/// Where one photo is.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct PhotoLocalization {
-    /// Name as the user knows it.
-    pub name: String,
-    /// The camera, with intrinsics refined when they were not known.
-    pub camera: Camera,
-    /// Pose in the scene's frame, `None` when not localized.
-    pub world_from_camera: Option<Rigid>,
-    /// Covariance of the pose: rotation (rad, in the camera frame), then centre (scene units, in the scene frame).
-    pub covariance: Option<Matrix6<f64>>,
-    /// Observations that support the pose.
-    pub inliers: usize,
-    /// The answer in one word.
-    pub verdict: Verdict,
-    /// Why, in sentences.
-    pub reasons: Vec<String>,
-}
-
-/// How to localize one photo.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct SingleParams {}
-
-/// How to localize an image set.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct CamsetParams {}
-
-/// Where the photos of a set are.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct SetLocalization {
-    /// Pose of the rigid camera set, one entry a photo ("camset").
-    pub rigid: Vec<PhotoLocalization>,
-    /// Poses after the joint refinement, one entry a photo ("camset+opt").
-    pub refined: Vec<PhotoLocalization>,
-    /// Scene from local model, one per used component.
-    pub world_from_set: Vec<Similarity>,
-    /// Weakest links and which photo to take next, in sentences.
-    pub advice: Vec<String>,
-}
-
-/// Localizes one photo alone.
-pub fn locate_single(_params: &SingleParams, _scene: &Scene<'_>, photo: &QueryPhoto<'_>, _seed: u64) -> PhotoLocalization {
-    PhotoLocalization {
-        name: photo.name.to_owned(),
-        camera: photo.camera.clone(),
-        world_from_camera: None,
-        covariance: None,
-        inliers: 0,
-        verdict: Verdict::NotLocalized,
-        reasons: Vec::new(),
-    }
-}
-
-/// Localizes a set through its local models (components of the photos' own reconstruction, largest first).
+/// Version of the answers; bumped whenever equal inputs give another answer.
 ///
-/// Image ids of `local_models` are indices into `photos`.
-pub fn locate_set(
-    _params: &CamsetParams,
-    _scene: &Scene<'_>,
-    _photos: &[QueryPhoto<'_>],
-    _local_models: &[Reconstruction],
-    _seed: u64,
-) -> SetLocalization {
-    SetLocalization::default()
-}
+/// 1: single photos, rigid sets, joint refinement.
+pub const VERSION: u32 = 1;

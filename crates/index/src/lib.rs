@@ -1,21 +1,27 @@
 //! The scene's descriptors made searchable: 2D-to-3D and 3D-to-3D matching.
+//!
+//! A [`SceneIndex`] answers one question, for one descriptor or for all descriptors of a local 3D point: which two
+//! *scene points* are nearest? Two observations of one point never compete with each other, so the ratio test of the
+//! paper compares places and not photographs of the same place. Which search answers the question (exact, inverted
+//! lists, kd-tree) is a parameter; approximate searches measure their recall when they are built and carry it along.
+//!
+//! The index is self-contained: it holds positions, covisibility and what guided matching needs of every
+//! observation, so no features and no reconstruction have to be kept beside it. It knows no poses of queries.
 
-use serde::{Deserialize, Serialize};
-use setloc_features::ImageFeatures;
-use setloc_sfm::Reconstruction;
+mod kernel;
+mod matching;
+mod nearest;
+mod params;
+mod scene_index;
+mod search;
 
-/// How to index a scene.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct IndexParams {}
+pub use kernel::{squared_distance, squared_distances};
+pub use matching::{Correspondence, LocalDescriptors, PointCorrespondence};
+pub use nearest::{NearestPoints, Neighbour};
+pub use params::{Backend, IndexParams};
+pub use scene_index::{Row, SceneIndex};
 
-/// Searchable descriptors of a scene; self-contained (needs no features once built).
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct SceneIndex {}
-
-impl SceneIndex {
-    /// Indexes the descriptors of all observations of all points; `features[i]` belongs to image `i`.
-    pub fn build(_params: &IndexParams, _reconstruction: &Reconstruction, _features: &[&ImageFeatures]) -> Self {
-        Self {}
-    }
-}
+/// Version of the index's contents; bumped whenever equal inputs give another index.
+///
+/// 1: exact, inverted lists, kd-tree over eight principal components.
+pub const VERSION: u32 = 1;

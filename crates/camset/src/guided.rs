@@ -1,0 +1,108 @@
+//! Guided matching: scene points are projected with a known pose and searched for nearby.
+
+use std::collections::BTreeMap;
+
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use nalgebra::Vector2;
+use setloc_features::Camera;
+use setloc_index::{NearestPoints, SceneIndex, squared_distance};
+use setloc_sfm::{PointId, Rigid};
+
+use crate::GuidedParams;
+use crate::evidence::{PhotoRays, SceneMatch};
+
+/// Matches between scene points and the photo's features near their projections, sorted by feature.
+///
+/// `nearest[i]` are the scene points nearest to feature `i`: a feature is accepted for a point only when the point
+/// is (nearly) as close as the closest point of the whole scene, so that a wrong pose finds hardly anything.
+pub(crate) fn guided_matches(
+    params: &GuidedParams,
+    index: &SceneIndex,
+    photo: &PhotoRays<'_>,
+    nearest: &[NearestPoints],
+    world_from_camera: &Rigid,
+) -> Vec<SceneMatch> {
+    let usable: Vec<u32> =
+        (0..photo.features.len() as u32).filter(|&i| photo.rays.sigmas[i as usize].is_finite()).collect();
+    let bearings: Vec<[f64; 3]> = usable.iter().map(|&i| photo.rays.bearings[i as usize].into()).collect();
+    let Some(tree) =
+        (!bearings.is_empty()).then(|| ImmutableKdTree::<f64, 3>::new_from_slice(&bearings).ok()).flatten()
+    else {
+        return Vec::new();
+    };
+    let slack2 = params.slack * params.slack;
+    let ratio2 = params.ratio * params.ratio;
+    // Per feature the best point: (squared distance, point).
+    let mut chosen: BTreeMap<u32, (u32, PointId)> = BTreeMap::new();
+    for point in (0..index.point_count() as u32).map(PointId) {
+        let offset = index.position(point) - world_from_camera.translation;
+        let distance = offset.norm();
+        let direction_in_camera = world_from_camera.rotation.inverse_transform_vector(&offset);
+        let Some(pixel) =
+            photo.camera.project(&direction_in_camera).filter(|pixel| inside(photo.camera, pixel))
+        else {
+            continue;
+        };
+        let Some(angle) = photo.camera.pixel_angle(&pixel).filter(|angle| *angle > 0.0) else { continue };
+        let views: Vec<u32> = index
+            .rows_of(point)
+            .iter()
+            .copied()
+            .filter(|&row| {
+                let row = index.row(row);
+                index.center(row.image).is_some_and(|center| {
+                    let view = index.position(point) - center;
+                    view.angle(&offset) < params.max_view_angle_rad
+                })
+            })
+            .collect();
+        if views.is_empty() {
+            continue;
+        }
+        let query: [f64; 3] = (direction_in_camera / distance).into();
+        let radius = params.radius_px * angle;
+        let found = tree.query(&query).within::<SquaredEuclidean<f64>>(radius * radius).execute();
+        let mut near: Vec<u32> = found.into_iter().map(|item| usable[item.item as usize]).collect();
+        near.sort_unstable();
+        let (mut best, mut second) = (None::<(u32, u32)>, u32::MAX);
+        for feature in near {
+            let size = f64::from(photo.features.keypoints[feature as usize].size);
+            let descriptor = photo.features.descriptor(feature as usize);
+            let distance2 = views
+                .iter()
+                .filter(|&&row| {
+                    let expected = f64::from(index.row(row).extent) / distance / angle;
+                    let factor = size / expected;
+                    !(expected > 0.0)
+                        || (factor < params.max_scale_factor && factor * params.max_scale_factor > 1.0)
+                })
+                .map(|&row| squared_distance(descriptor, index.descriptor(row)))
+                .min();
+            let Some(distance2) = distance2 else { continue };
+            match best {
+                Some((_, least)) if distance2 >= least => second = second.min(distance2),
+                _ => {
+                    second = best.map_or(second, |(_, least)| second.min(least));
+                    best = Some((feature, distance2));
+                }
+            }
+        }
+        let Some((feature, distance2)) = best else { continue };
+        let global = nearest[feature as usize].first.map_or(u32::MAX, |first| first.distance2);
+        let distinct = second == u32::MAX || f64::from(distance2) < ratio2 * f64::from(second);
+        if distinct && f64::from(distance2) <= slack2 * f64::from(global) {
+            let entry = chosen.entry(feature).or_insert((distance2, point));
+            if distance2 < entry.0 {
+                *entry = (distance2, point);
+            }
+        }
+    }
+    chosen.into_iter().map(|(feature, (_, point))| SceneMatch { feature, point }).collect()
+}
+
+fn inside(camera: &Camera, pixel: &Vector2<f64>) -> bool {
+    pixel.x >= 0.0
+        && pixel.y >= 0.0
+        && pixel.x < f64::from(camera.width)
+        && pixel.y < f64::from(camera.height)
+}

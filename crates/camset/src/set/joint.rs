@@ -1,0 +1,495 @@
+//! One component of a set: rigid pose, joint refinement with guided matching, verdicts.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use nalgebra::Matrix6;
+use rayon::prelude::*;
+use setloc_features::Camera;
+use setloc_sfm::{PointId, Reconstruction, Rigid, Similarity};
+
+use super::PhotoEvidence;
+use super::correspondences::{SetCorrespondence, correspondences, set_rays};
+use super::rigid::{RigidPose, rigid_pose};
+use crate::evidence::{
+    PhotoRays, SceneMatch, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose,
+};
+use crate::guided::guided_matches;
+use crate::refine::{JointModel, JointPhoto, TrackObservation, refine_jointly};
+use crate::single::{inliers, union};
+use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
+use crate::{CamsetParams, GuidedParams, PhotoLocalization, QueryPhoto, Scene, Verdict};
+
+/// Correspondences in a minimal sample of the generalized pose with scale.
+const SAMPLE: usize = 4;
+/// Factors on inlier bound and search radius in the last rounds; before, drift may still be larger.
+const WIDENING: [f64; 3] = [2.5, 1.5, 1.0];
+/// Share of the rigid pose's correspondences that the joint refinement has to bring within the inlier bound.
+const MIN_KEPT: f64 = 0.5;
+
+/// What became of one local model.
+pub(crate) enum ComponentAnswer {
+    Localized(Box<ComponentPoses>),
+    Refused {
+        reasons: Vec<String>,
+        /// Matches to the scene of each photo, right or wrong.
+        scene_points: Vec<usize>,
+    },
+}
+
+/// Poses of one component, slot by slot.
+pub(crate) struct ComponentPoses {
+    pub world_from_set: Similarity,
+    pub rigid: Vec<PhotoLocalization>,
+    pub refined: Vec<PhotoLocalization>,
+    /// Scene points that each photo sees itself.
+    pub scene_points: Vec<usize>,
+    pub remarks: Vec<String>,
+}
+
+/// A local model of at least two photos and what is known of them.
+pub(crate) struct Component<'a> {
+    pub params: &'a CamsetParams,
+    pub scene: &'a Scene<'a>,
+    pub photos: &'a [QueryPhoto<'a>],
+    pub evidence: &'a [PhotoEvidence],
+    pub model: &'a Reconstruction,
+    /// Photo indices by slot, ascending.
+    pub members: &'a [usize],
+}
+
+/// The joint refinement's result.
+struct Joint {
+    model: JointModel,
+    /// Scene points that each photo sees itself, within the inlier bound.
+    direct: Vec<Vec<SceneMatch>>,
+    covariances: Vec<Option<Matrix6<f64>>>,
+}
+
+/// Observations of one round of the joint refinement.
+struct Observations {
+    direct: Vec<Vec<SceneMatch>>,
+    tracks: Vec<TrackObservation>,
+}
+
+impl Component<'_> {
+    /// Localizes the component.
+    pub(crate) fn locate(&self, seed: u64) -> ComponentAnswer {
+        let params = self.params;
+        let rays = self.rays(&self.model.cameras);
+        let set_from_camera: Vec<Rigid> = self
+            .members
+            .iter()
+            .map(|&photo| self.model.images[photo].world_from_camera.unwrap_or_default())
+            .collect();
+        let candidates =
+            correspondences(params, self.scene.index, self.model, self.members, &rays, self.evidence);
+        let mut scene_points = vec![0; self.members.len()];
+        for &(slot, _) in candidates.iter().flat_map(|candidate| &candidate.seen_by) {
+            scene_points[slot] += 1;
+        }
+        let set_rays = set_rays(params, self.scene.index, &set_from_camera, &rays, &candidates);
+        let rigid =
+            rigid_pose(params, &candidates, &set_rays, &set_from_camera, self.members, self.evidence, seed);
+        let Some(rigid) = rigid else {
+            let reasons =
+                vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];
+            return ComponentAnswer::Refused { reasons, scene_points };
+        };
+        let mut reasons = Vec::new();
+        let evidence = self.support(&rays, &set_from_camera, &candidates, &rigid);
+        let support = judge_support(&params.verdict, &evidence, &mut reasons);
+        if support == Verdict::NotLocalized {
+            return ComponentAnswer::Refused { reasons, scene_points };
+        }
+        let joint = self.refine_jointly(&set_from_camera, &candidates, &rigid);
+        let refined = self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
+        let undetermined = rigid.observability.undetermined();
+        let mut rigid_support = support;
+        if !undetermined.is_empty() {
+            reasons.push(format!(
+                "the rays of the rigid set do not determine its {}",
+                undetermined.join(" and ")
+            ));
+            rigid_support = Verdict::Uncertain;
+        }
+        let names: Vec<&str> = self.members.iter().map(|&photo| self.photos[photo].name).collect();
+        let remarks = vec![format!("the local model of {}: {}", names.join(", "), reasons.join("; "))];
+        let rigid_answers =
+            self.rigid_answers(&set_from_camera, &candidates, &rigid, rigid_support, &reasons);
+        ComponentAnswer::Localized(Box::new(ComponentPoses {
+            world_from_set: rigid.world_from_set,
+            rigid: rigid_answers,
+            scene_points: joint.direct.iter().map(Vec::len).collect(),
+            refined,
+            remarks,
+        }))
+    }
+
+    fn camera_of(&self, slot: usize) -> usize {
+        self.model.images[self.members[slot]].camera.index()
+    }
+
+    fn rays<'c>(&'c self, cameras: &'c [Camera]) -> Vec<PhotoRays<'c>> {
+        (0..self.members.len())
+            .into_par_iter()
+            .map(|slot| {
+                PhotoRays::new(self.photos[self.members[slot]].features, &cameras[self.camera_of(slot)])
+            })
+            .collect()
+    }
+
+    /// What supports the rigid pose, photos taken together.
+    fn support(
+        &self,
+        rays: &[PhotoRays<'_>],
+        set_from_camera: &[Rigid],
+        candidates: &[SetCorrespondence],
+        rigid: &RigidPose,
+    ) -> Evidence {
+        let mut by_slot: Vec<Vec<SceneMatch>> = vec![Vec::new(); self.members.len()];
+        for &number in &rigid.agreeing {
+            for &(slot, feature) in &candidates[number].seen_by {
+                by_slot[slot].push(SceneMatch { feature, point: candidates[number].scene });
+            }
+        }
+        let (mut chance, mut total, mut cells) = (0.0, 0, 0);
+        for (slot, matches) in by_slot.iter().enumerate() {
+            let pose = rigid.world_from_set.transform_pose(&set_from_camera[slot]);
+            let noise = median(
+                matches.iter().map(|&m| rays[slot].match_noise_px(self.scene.index, &pose, m)).collect(),
+            );
+            // The bound that was applied includes drift.
+            let drift = self.params.drift_px / noise.unwrap_or(1.0);
+            let bound = self.params.max_error_sigmas.hypot(drift);
+            let own = chance_of_inlier(&rays[slot], self.scene.index, &pose, matches, bound);
+            chance += own * matches.len() as f64;
+            total += matches.len();
+            cells = cells.max(occupied_cells(&rays[slot], matches.iter().map(|m| m.feature)));
+        }
+        let inliers = rigid.agreeing.len();
+        let chance = if total > 0 { chance / total as f64 } else { 1.0 };
+        Evidence {
+            matches: candidates.len(),
+            inliers,
+            sample: SAMPLE,
+            log10_false_alarms: log10_false_alarms(candidates.len(), inliers, SAMPLE, chance),
+            cells,
+            runner_up: rigid.runner_up,
+        }
+    }
+
+    /// The paper's T_OPT, in rounds: observations are chosen under the present poses, then all poses move.
+    fn refine_jointly(
+        &self,
+        set_from_camera: &[Rigid],
+        candidates: &[SetCorrespondence],
+        rigid: &RigidPose,
+    ) -> Joint {
+        let world_from_set = &rigid.world_from_set;
+        let mut model = JointModel {
+            cameras: self.model.cameras.clone(),
+            camera_fixed: self.fixed_cameras(),
+            photos: set_from_camera
+                .iter()
+                .enumerate()
+                .map(|(slot, pose)| JointPhoto {
+                    camera: self.camera_of(slot),
+                    world_from_camera: world_from_set.transform_pose(pose),
+                })
+                .collect(),
+            points: self
+                .model
+                .points
+                .iter()
+                .map(|point| world_from_set.transform_point(&point.position))
+                .collect(),
+        };
+        let mut covariances = Vec::new();
+        for round in 0..=self.params.rounds {
+            let cameras = model.cameras.clone();
+            let rays = self.rays(&cameras);
+            let observations = if round == 0 {
+                self.rigid_observations(candidates, &rigid.agreeing)
+            } else {
+                let steps = (self.params.rounds - round).min(WIDENING.len() - 1);
+                self.observations(&model, &rays, candidates, WIDENING[WIDENING.len() - 1 - steps])
+            };
+            let Observations { direct, tracks } = observations;
+            let last = round == self.params.rounds;
+            covariances = refine_jointly(&mut model, self.scene.index, &rays, &direct, &tracks, last);
+        }
+        let rays = self.rays(&model.cameras);
+        let direct = self.observations(&model, &rays, candidates, 1.0).direct;
+        Joint { model, direct, covariances }
+    }
+
+    /// A camera is known when all photos that share it say so.
+    fn fixed_cameras(&self) -> Vec<bool> {
+        let mut fixed = vec![true; self.model.cameras.len()];
+        for (slot, &photo) in self.members.iter().enumerate() {
+            fixed[self.camera_of(slot)] &= self.photos[photo].camera_fixed;
+        }
+        fixed
+    }
+
+    /// Correspondences that agree with the rigid pose, as they are.
+    fn rigid_observations(&self, candidates: &[SetCorrespondence], agreeing: &[usize]) -> Observations {
+        let mut direct = vec![Vec::new(); self.members.len()];
+        let mut tied = BTreeSet::new();
+        for &number in agreeing {
+            let candidate = &candidates[number];
+            tied.extend(candidate.local);
+            for &(slot, feature) in &candidate.seen_by {
+                direct[slot].push(SceneMatch { feature, point: candidate.scene });
+            }
+        }
+        Observations { direct: direct.into_iter().map(unique).collect(), tracks: self.free_tracks(&tied) }
+    }
+
+    /// Correspondences and guided matches that agree with the present poses.
+    ///
+    /// A local point that is a scene point is replaced by it, in all photos that see it.
+    fn observations(
+        &self,
+        model: &JointModel,
+        rays: &[PhotoRays<'_>],
+        candidates: &[SetCorrespondence],
+        widening: f64,
+    ) -> Observations {
+        let index = self.scene.index;
+        let bound = self.params.max_error_sigmas * widening;
+        let guided_params =
+            GuidedParams { radius_px: self.params.guided.radius_px * widening, ..self.params.guided.clone() };
+        let guided: Vec<Vec<SceneMatch>> = (0..self.members.len())
+            .into_par_iter()
+            .map(|slot| {
+                let pose = &model.photos[slot].world_from_camera;
+                let nearest = &self.evidence[self.members[slot]].nearest;
+                guided_matches(&guided_params, index, &rays[slot], nearest, pose)
+            })
+            .collect();
+        let agrees = |slot: usize, feature: u32, point: PointId| {
+            let found = SceneMatch { feature, point };
+            rays[slot].error_sigmas(index, &model.photos[slot].world_from_camera, found) < bound
+        };
+        let local_of = self.local_points_of_features();
+        let mut votes: BTreeMap<usize, BTreeMap<PointId, usize>> = BTreeMap::new();
+        let mut lone: Vec<Vec<SceneMatch>> = vec![Vec::new(); self.members.len()];
+        for candidate in candidates {
+            match candidate.local {
+                Some(local) => *votes.entry(local).or_default().entry(candidate.scene).or_default() += 1,
+                None => lone[candidate.seen_by[0].0]
+                    .push(SceneMatch { feature: candidate.seen_by[0].1, point: candidate.scene }),
+            }
+        }
+        for (slot, found) in guided.iter().enumerate() {
+            let mut own = Vec::new();
+            for &found in found {
+                match local_of[slot].get(&found.feature) {
+                    Some(&local) => *votes.entry(local).or_default().entry(found.point).or_default() += 1,
+                    None => own.push(found),
+                }
+            }
+            lone[slot] = union(
+                &inliers(&rays[slot], index, &model.photos[slot].world_from_camera, &lone[slot], bound),
+                &own,
+            );
+        }
+        let mut direct: Vec<Vec<SceneMatch>> = vec![Vec::new(); self.members.len()];
+        let mut tied = BTreeSet::new();
+        for (local, votes) in votes {
+            let track = self.track(local);
+            let best = votes
+                .into_iter()
+                .map(|(point, votes)| {
+                    let agreeing =
+                        track.iter().filter(|&&(slot, feature)| agrees(slot, feature, point)).count();
+                    (agreeing, votes, std::cmp::Reverse(point))
+                })
+                .max();
+            let Some((agreeing, _, std::cmp::Reverse(point))) = best else { continue };
+            if agreeing == 0 || 2 * agreeing < track.len() {
+                continue;
+            }
+            tied.insert(local);
+            for (slot, feature) in track {
+                if agrees(slot, feature, point) {
+                    direct[slot].push(SceneMatch { feature, point });
+                }
+            }
+        }
+        for (slot, lone) in lone.iter().enumerate() {
+            let agreeing = inliers(&rays[slot], index, &model.photos[slot].world_from_camera, lone, bound);
+            direct[slot] = unique(union(&direct[slot], &agreeing));
+        }
+        let tracks = agreeing_tracks(model, rays, self.free_tracks(&tied), bound);
+        Observations { direct, tracks }
+    }
+
+    /// Slots and features that see a local point.
+    fn track(&self, local: usize) -> Vec<(usize, u32)> {
+        self.model.points[local]
+            .track
+            .iter()
+            .filter_map(|o| Some((self.members.binary_search(&o.image.index()).ok()?, o.feature)))
+            .filter(|&(slot, feature)| (feature as usize) < self.photos[self.members[slot]].features.len())
+            .collect()
+    }
+
+    fn local_points_of_features(&self) -> Vec<BTreeMap<u32, usize>> {
+        let mut local_of = vec![BTreeMap::new(); self.members.len()];
+        for local in 0..self.model.points.len() {
+            for (slot, feature) in self.track(local) {
+                local_of[slot].insert(feature, local);
+            }
+        }
+        local_of
+    }
+
+    /// Observations of all local points that are not scene points.
+    fn free_tracks(&self, tied: &BTreeSet<usize>) -> Vec<TrackObservation> {
+        (0..self.model.points.len())
+            .filter(|local| !tied.contains(local))
+            .flat_map(|point| {
+                let track = self.track(point);
+                let seen_twice = track.len() >= 2;
+                track.into_iter().filter(move |_| seen_twice).map(move |(photo, feature)| TrackObservation {
+                    photo,
+                    feature,
+                    point,
+                })
+            })
+            .collect()
+    }
+
+    fn rigid_answers(
+        &self,
+        set_from_camera: &[Rigid],
+        candidates: &[SetCorrespondence],
+        rigid: &RigidPose,
+        verdict: Verdict,
+        reasons: &[String],
+    ) -> Vec<PhotoLocalization> {
+        let mut seen = vec![0; self.members.len()];
+        for &(slot, _) in rigid.agreeing.iter().flat_map(|&number| &candidates[number].seen_by) {
+            seen[slot] += 1;
+        }
+        let spread = &rigid.observability;
+        let precision = format!(
+            "as a rigid set: rotation ± {:.2}°, position ± {:.1} % of the viewing distance, scale ± {:.1} %",
+            spread.rotation_rad.to_degrees(),
+            100.0 * spread.position,
+            100.0 * spread.log_scale
+        );
+        (0..self.members.len())
+            .map(|slot| PhotoLocalization {
+                name: self.photos[self.members[slot]].name.to_owned(),
+                camera: self.model.cameras[self.camera_of(slot)].clone(),
+                world_from_camera: Some(rigid.world_from_set.transform_pose(&set_from_camera[slot])),
+                covariance: None,
+                inliers: seen[slot],
+                verdict,
+                reasons: reasons.iter().cloned().chain([precision.clone()]).collect(),
+            })
+            .collect()
+    }
+
+    fn refined_answers(
+        &self,
+        candidates: &[SetCorrespondence],
+        rigid: &RigidPose,
+        joint: &Joint,
+        support: Verdict,
+        reasons: &[String],
+    ) -> Vec<PhotoLocalization> {
+        let kept = rigid.agreeing.iter().filter(|&&number| {
+            let candidate = &candidates[number];
+            let seen = |&(slot, feature): &(usize, u32)| {
+                joint.direct[slot].binary_search(&SceneMatch { feature, point: candidate.scene }).is_ok()
+            };
+            candidate.seen_by.iter().any(seen)
+        });
+        let kept = kept.count() as f64 / rigid.agreeing.len().max(1) as f64;
+        (0..self.members.len())
+            .map(|slot| {
+                let photo = self.members[slot];
+                let pose = joint.model.photos[slot].world_from_camera;
+                let mut reasons = reasons.to_vec();
+                let depth = self.depth(joint, slot);
+                let covariance = joint.covariances.get(slot).copied().flatten();
+                let precision =
+                    judge_precision(&self.params.verdict, covariance.as_ref(), depth, &mut reasons);
+                let mut verdict = support;
+                if kept < MIN_KEPT {
+                    reasons.push(format!(
+                        "{:.0} % of these matches fit after the joint refinement only",
+                        100.0 * kept
+                    ));
+                    verdict = weaker(verdict, Verdict::Uncertain);
+                }
+                let alone = &self.evidence[photo].alone;
+                if let Some(other) = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized) {
+                    // The photo's own matches are evidence that the set's pose did not create.
+                    if same_pose(&pose, &other, depth) {
+                        reasons.push("localized alone, it stands at the same place".to_owned());
+                        verdict = Verdict::Localized;
+                    } else {
+                        reasons.push("localized alone, it stands elsewhere".to_owned());
+                        verdict = Verdict::Uncertain;
+                    }
+                }
+                let verdict = weaker(verdict, precision);
+                PhotoLocalization {
+                    name: self.photos[photo].name.to_owned(),
+                    camera: joint.model.cameras[self.camera_of(slot)].clone(),
+                    world_from_camera: Some(pose),
+                    covariance,
+                    inliers: joint.direct[slot].len(),
+                    verdict,
+                    reasons,
+                }
+            })
+            .collect()
+    }
+
+    /// Median distance from a photo to the scene points that it sees, else to its local points.
+    fn depth(&self, joint: &Joint, slot: usize) -> f64 {
+        let center = joint.model.photos[slot].world_from_camera.translation;
+        let to_scene =
+            joint.direct[slot].iter().map(|m| (self.scene.index.position(m.point) - center).norm()).collect();
+        median(to_scene)
+            .or_else(|| {
+                let sees = |local: &usize| self.track(*local).iter().any(|&(seer, _)| seer == slot);
+                let local = (0..self.model.points.len()).filter(sees);
+                median(local.map(|local| (joint.model.points[local] - center).norm()).collect())
+            })
+            .unwrap_or(0.0)
+    }
+}
+
+/// The observations that agree with the present poses and local points; points seen once only are left out.
+fn agreeing_tracks(
+    model: &JointModel,
+    rays: &[PhotoRays<'_>],
+    tracks: Vec<TrackObservation>,
+    bound: f64,
+) -> Vec<TrackObservation> {
+    let mut seen = vec![0_usize; model.points.len()];
+    let mut agreeing = tracks;
+    agreeing.retain(|track| {
+        let pose = &model.photos[track.photo].world_from_camera;
+        let agrees =
+            rays[track.photo].point_error_sigmas(pose, track.feature, &model.points[track.point]) < bound;
+        seen[track.point] += usize::from(agrees);
+        agrees
+    });
+    agreeing.retain(|track| seen[track.point] >= 2);
+    agreeing
+}
+
+/// Each feature once, by its first match; sorted.
+fn unique(mut matches: Vec<SceneMatch>) -> Vec<SceneMatch> {
+    matches.sort_unstable();
+    matches.dedup_by_key(|m| m.feature);
+    matches
+}

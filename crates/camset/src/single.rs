@@ -1,0 +1,383 @@
+use std::collections::BTreeMap;
+
+use nalgebra::{Matrix6, Vector3};
+use setloc_features::{Camera, ParamRole};
+use setloc_index::{NearestPoints, SceneIndex};
+use setloc_sfm::robust::{RansacParams, estimate_absolute_pose};
+use setloc_sfm::{ImageId, Rigid};
+
+use crate::evidence::{
+    PhotoRays, SceneMatch, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose,
+};
+use crate::guided::guided_matches;
+use crate::refine::{JointModel, JointPhoto, refine_jointly};
+use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
+use crate::{PhotoLocalization, QueryPhoto, Scene, SingleParams, Verdict};
+
+/// Points in a minimal sample of P3P.
+const SAMPLE: usize = 3;
+/// Factors on a guessed focal length, tried in turn where the intrinsics are not known.
+const FOCAL_FACTORS: [f64; 7] = [1.0, 0.84, 1.19, 0.71, 1.41, 0.56, 1.78];
+
+/// A pose of one photo with everything that speaks for it.
+struct SinglePose {
+    camera: Camera,
+    world_from_camera: Rigid,
+    covariance: Option<Matrix6<f64>>,
+    /// Inliers after guided matching.
+    inliers: Vec<SceneMatch>,
+    /// Median distance to the inliers' scene points.
+    depth: f64,
+    evidence: Evidence,
+}
+
+/// Localizes one photo alone.
+///
+/// 2D-to-3D matches pass a ratio test, LO-RANSAC with P3P finds the pose, scene points are then searched for near
+/// their projections and the pose (with the intrinsics, when they are not known) is refined on all inliers.
+/// (T. Sattler, B. Leibe, L. Kobbelt, "Fast image-based localization using direct 2D-to-3D matching", ICCV 2011.)
+pub fn locate_single(
+    params: &SingleParams,
+    scene: &Scene<'_>,
+    photo: &QueryPhoto<'_>,
+    seed: u64,
+) -> PhotoLocalization {
+    let nearest = scene.index.nearest_points(&photo.features.descriptors);
+    locate_with_nearest(params, scene, photo, &nearest, seed)
+}
+
+/// [`locate_single`] where the nearest scene points of all features are already known.
+pub(crate) fn locate_with_nearest(
+    params: &SingleParams,
+    scene: &Scene<'_>,
+    photo: &QueryPhoto<'_>,
+    nearest: &[NearestPoints],
+    seed: u64,
+) -> PhotoLocalization {
+    let matches: Vec<SceneMatch> = scene
+        .index
+        .correspondences(nearest, params.ratio)
+        .into_iter()
+        .map(|c| SceneMatch { feature: c.feature, point: c.point })
+        .collect();
+    if matches.len() < params.verdict.min_inliers {
+        let reason = format!(
+            "{} of its features resemble a scene point, at least {} must",
+            matches.len(),
+            params.verdict.min_inliers
+        );
+        return PhotoLocalization::not_localized(photo, reason);
+    }
+    let Some(found) = solve(params, scene, photo, nearest, &matches, seed) else {
+        let reason = format!("no pose explains any of its {} matches to the scene", matches.len());
+        return PhotoLocalization::not_localized(photo, reason);
+    };
+    let mut reasons = Vec::new();
+    let mut verdict = judge_support(&params.verdict, &found.evidence, &mut reasons);
+    if verdict == Verdict::NotLocalized {
+        let mut refused = PhotoLocalization::not_localized(photo, String::new());
+        (refused.reasons, refused.inliers) = (reasons, found.evidence.inliers);
+        return refused;
+    }
+    verdict = weaker(
+        verdict,
+        judge_precision(&params.verdict, found.covariance.as_ref(), found.depth, &mut reasons),
+    );
+    PhotoLocalization {
+        name: photo.name.to_owned(),
+        camera: found.camera,
+        world_from_camera: Some(found.world_from_camera),
+        covariance: found.covariance,
+        inliers: found.inliers.len(),
+        verdict,
+        reasons,
+    }
+}
+
+struct Hypothesis {
+    camera: Camera,
+    pose: Rigid,
+    score: f64,
+}
+
+fn solve(
+    params: &SingleParams,
+    scene: &Scene<'_>,
+    photo: &QueryPhoto<'_>,
+    nearest: &[NearestPoints],
+    matches: &[SceneMatch],
+    seed: u64,
+) -> Option<SinglePose> {
+    let best = best_hypothesis(params, scene, photo, matches, seed)?;
+    let mut model = JointModel {
+        cameras: vec![best.camera],
+        camera_fixed: vec![photo.camera_fixed],
+        photos: vec![JointPhoto { camera: 0, world_from_camera: best.pose }],
+        points: Vec::new(),
+    };
+    refine(&mut model, scene.index, photo, matches, params.max_error_sigmas, false);
+    let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
+    let rays = PhotoRays::new(photo.features, &camera);
+    let agreeing = inliers(&rays, scene.index, &pose, matches, params.max_error_sigmas);
+    let depth =
+        median(agreeing.iter().map(|m| (scene.index.position(m.point) - pose.translation).norm()).collect())?;
+    let rest: Vec<SceneMatch> = matches.iter().copied().filter(|m| !agreeing.contains(m)).collect();
+    let runner_up = runner_up(params, scene.index, &rays, &rest, &pose, depth, seed);
+    let chance = chance_of_inlier(&rays, scene.index, &pose, &agreeing, params.max_error_sigmas);
+    let evidence = Evidence {
+        matches: matches.len(),
+        inliers: agreeing.len(),
+        sample: SAMPLE,
+        log10_false_alarms: log10_false_alarms(matches.len(), agreeing.len(), SAMPLE, chance),
+        cells: occupied_cells(&rays, agreeing.iter().map(|m| m.feature)),
+        runner_up,
+    };
+    if agreeing.len() < params.verdict.min_inliers {
+        return Some(SinglePose {
+            camera,
+            world_from_camera: pose,
+            covariance: None,
+            inliers: agreeing,
+            depth,
+            evidence,
+        });
+    }
+    let guided = guided_matches(&params.guided, scene.index, &rays, nearest, &pose);
+    let candidates = union(&agreeing, &guided);
+    let covariance = refine(&mut model, scene.index, photo, &candidates, params.max_error_sigmas, true);
+    let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
+    let rays = PhotoRays::new(photo.features, &camera);
+    let inliers = inliers(&rays, scene.index, &pose, &candidates, params.max_error_sigmas);
+    Some(SinglePose { camera, world_from_camera: pose, covariance, inliers, depth, evidence })
+}
+
+/// Refines the one photo of `model` on the matches that agree with it, twice, so that new inliers join.
+fn refine(
+    model: &mut JointModel,
+    index: &SceneIndex,
+    photo: &QueryPhoto<'_>,
+    matches: &[SceneMatch],
+    max_error_sigmas: f64,
+    with_covariance: bool,
+) -> Option<Matrix6<f64>> {
+    let mut covariance = None;
+    for last in [false, true] {
+        let camera = model.cameras[0].clone();
+        let rays = PhotoRays::new(photo.features, &camera);
+        let agreeing = inliers(&rays, index, &model.photos[0].world_from_camera, matches, max_error_sigmas);
+        if agreeing.len() <= SAMPLE {
+            return None;
+        }
+        let covariances = refine_jointly(model, index, &[rays], &[agreeing], &[], last && with_covariance);
+        covariance = covariances.into_iter().next().flatten();
+    }
+    covariance
+}
+
+pub(crate) fn inliers(
+    rays: &PhotoRays<'_>,
+    index: &SceneIndex,
+    pose: &Rigid,
+    matches: &[SceneMatch],
+    max_error_sigmas: f64,
+) -> Vec<SceneMatch> {
+    matches.iter().copied().filter(|&m| rays.error_sigmas(index, pose, m) < max_error_sigmas).collect()
+}
+
+/// First list, then those of the second whose feature and point are both new; sorted.
+pub(crate) fn union(first: &[SceneMatch], second: &[SceneMatch]) -> Vec<SceneMatch> {
+    let mut all = first.to_vec();
+    let features: std::collections::BTreeSet<u32> = first.iter().map(|m| m.feature).collect();
+    let points: std::collections::BTreeSet<_> = first.iter().map(|m| m.point).collect();
+    all.extend(second.iter().filter(|m| !features.contains(&m.feature) && !points.contains(&m.point)));
+    all.sort_unstable();
+    all
+}
+
+/// The pose of greatest truncated score over all matches, from all of them and from covisible parts of them.
+///
+/// Focal lengths take the place of the parts where the intrinsics are not known.
+fn best_hypothesis(
+    params: &SingleParams,
+    scene: &Scene<'_>,
+    photo: &QueryPhoto<'_>,
+    matches: &[SceneMatch],
+    seed: u64,
+) -> Option<Hypothesis> {
+    let mut subsets = vec![matches.to_vec()];
+    if photo.camera_fixed {
+        subsets.extend(covisible_subsets(scene.index, matches, params.covisible_images));
+    }
+    let cameras: Vec<Camera> = if photo.camera_fixed {
+        vec![photo.camera.clone()]
+    } else {
+        FOCAL_FACTORS.iter().map(|&factor| with_focal_factor(photo.camera, factor)).collect()
+    };
+    let mut best: Option<Hypothesis> = None;
+    for (number, camera) in cameras.into_iter().enumerate() {
+        let rays = PhotoRays::new(photo.features, &camera);
+        for (part, subset) in subsets.iter().enumerate() {
+            let seed = seed.wrapping_add((number * 64 + part) as u64);
+            let Some(pose) = estimate(params, scene.index, &rays, subset, seed) else { continue };
+            let score = score(params, scene.index, &rays, &pose, matches);
+            if best.as_ref().is_none_or(|best| score > best.score) {
+                best = Some(Hypothesis { camera: camera.clone(), pose, score });
+            }
+        }
+    }
+    best
+}
+
+fn estimate(
+    params: &SingleParams,
+    index: &SceneIndex,
+    rays: &PhotoRays<'_>,
+    matches: &[SceneMatch],
+    seed: u64,
+) -> Option<Rigid> {
+    let usable: Vec<SceneMatch> =
+        matches.iter().copied().filter(|m| rays.rays.sigmas[m.feature as usize].is_finite()).collect();
+    if usable.len() <= SAMPLE {
+        return None;
+    }
+    let bearings: Vec<Vector3<f64>> = usable.iter().map(|m| rays.rays.bearings[m.feature as usize]).collect();
+    let sigmas: Vec<f64> = usable.iter().map(|m| rays.rays.sigmas[m.feature as usize]).collect();
+    let points: Vec<Vector3<f64>> = usable.iter().map(|m| index.position(m.point)).collect();
+    let ransac = RansacParams {
+        max_error_sigma: params.max_error_sigmas,
+        max_iterations: params.max_samples.max(1),
+        min_iterations: RansacParams::default().min_iterations.min(params.max_samples.max(1)),
+        ..RansacParams::default()
+    };
+    estimate_absolute_pose(&ransac, &bearings, &sigmas, &points, seed).map(|found| found.world_from_camera)
+}
+
+/// Σ 1 − min(1, (e/T)²) over the matches.
+fn score(
+    params: &SingleParams,
+    index: &SceneIndex,
+    rays: &PhotoRays<'_>,
+    pose: &Rigid,
+    matches: &[SceneMatch],
+) -> f64 {
+    let gain = |&m: &SceneMatch| {
+        1.0 - (rays.error_sigmas(index, pose, m) / params.max_error_sigmas).min(1.0).powi(2)
+    };
+    matches.iter().map(gain).sum()
+}
+
+/// Support of the best pose that the remaining matches give, when it is another pose.
+fn runner_up(
+    params: &SingleParams,
+    index: &SceneIndex,
+    rays: &PhotoRays<'_>,
+    rest: &[SceneMatch],
+    best: &Rigid,
+    depth: f64,
+    seed: u64,
+) -> usize {
+    match estimate(params, index, rays, rest, seed ^ 0x5eed) {
+        Some(pose) if !same_pose(&pose, best, depth) => {
+            inliers(rays, index, &pose, rest, params.max_error_sigmas).len()
+        }
+        _ => 0,
+    }
+}
+
+/// Matches to points that the `count` best-supported scene images see, one list an image.
+fn covisible_subsets(index: &SceneIndex, matches: &[SceneMatch], count: usize) -> Vec<Vec<SceneMatch>> {
+    let mut by_image: BTreeMap<ImageId, Vec<SceneMatch>> = BTreeMap::new();
+    for &found in matches {
+        for &row in index.rows_of(found.point) {
+            by_image.entry(index.row(row).image).or_default().push(found);
+        }
+    }
+    let mut subsets: Vec<Vec<SceneMatch>> =
+        by_image.into_values().filter(|subset| subset.len() > SAMPLE).collect();
+    for subset in &mut subsets {
+        subset.dedup();
+    }
+    subsets.sort_by_key(|subset| std::cmp::Reverse(subset.len()));
+    subsets.truncate(count);
+    subsets
+}
+
+/// The camera with its focal length (or lengths) multiplied.
+fn with_focal_factor(camera: &Camera, factor: f64) -> Camera {
+    let mut scaled = camera.clone();
+    for (value, role) in scaled.params.iter_mut().zip(camera.param_roles()) {
+        if *role == ParamRole::Focal {
+            *value *= factor;
+        }
+    }
+    scaled
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::test_scene::World;
+
+    fn locate(world: &World, photo: usize) -> PhotoLocalization {
+        locate_single(&SingleParams::default(), &world.scene(), &world.queries()[photo], 3)
+    }
+
+    #[test]
+    fn a_photo_beside_the_panoramas_is_localized_and_one_far_away_is_refused() {
+        let world = World::chain(9, 0.3, 1);
+        let near = locate(&world, 0);
+        assert_eq!(near.verdict, Verdict::Localized, "{near:#?}");
+        let (center, rotation) = world.errors(0, &near.world_from_camera.unwrap());
+        assert!(center < 0.03 && rotation < 0.1, "{center} {rotation}");
+        assert!(near.inliers > 100);
+        let far = locate(&world, 8);
+        assert_eq!(far.verdict, Verdict::NotLocalized, "{far:#?}");
+        assert!(far.world_from_camera.is_none() && !far.reasons.is_empty());
+    }
+
+    #[test]
+    fn centre_errors_fit_the_covariance() {
+        let (mut squared, mut count) = (0.0, 0);
+        for seed in 20..30 {
+            let world = World::chain(4, 0.2, seed);
+            for photo in 0..2 {
+                let found = locate(&world, photo);
+                let (pose, covariance) = (found.world_from_camera.unwrap(), found.covariance.unwrap());
+                let error = pose.translation - world.photos[photo].pose.translation;
+                let information = covariance.fixed_view::<3, 3>(3, 3).into_owned().try_inverse().unwrap();
+                squared += error.dot(&(information * error)) / 3.0;
+                count += 1;
+            }
+        }
+        let mean = squared / f64::from(count);
+        assert!((0.4..1.8).contains(&mean), "{mean}");
+    }
+
+    #[test]
+    fn an_unknown_focal_length_is_found() {
+        let world = World::chain(2, 0.2, 11);
+        let mut guess = world.camera.clone();
+        guess.params[0] = 640.0;
+        guess.params[1] = 640.0;
+        let query = QueryPhoto { camera: &guess, camera_fixed: false, ..world.queries()[0] };
+        let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5);
+        assert!((found.camera.params[0] / 800.0 - 1.0).abs() < 0.01, "{:?}", found.camera.params);
+        let (center, rotation) = world.errors(0, &found.world_from_camera.unwrap());
+        assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
+    }
+
+    #[test]
+    fn foreign_and_empty_photos_are_refused() {
+        let world = World::chain(2, 0.2, 12);
+        for seed in 0..10 {
+            let elsewhere = World::chain(2, 0.2, 200 + seed);
+            let found =
+                locate_single(&SingleParams::default(), &world.scene(), &elsewhere.queries()[0], seed);
+            assert_eq!(found.verdict, Verdict::NotLocalized);
+        }
+        let empty = setloc_features::ImageFeatures::default();
+        let query = QueryPhoto { features: &empty, ..world.queries()[0] };
+        let found = locate_single(&SingleParams::default(), &world.scene(), &query, 1);
+        assert_eq!(found.verdict, Verdict::NotLocalized);
+    }
+}

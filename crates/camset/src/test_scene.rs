@@ -1,0 +1,267 @@
+//! A street with truth: panoramas at its beginning, a chain of photos that leads away from them.
+
+use nalgebra::{UnitQuaternion, Vector2, Vector3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
+use setloc_index::{IndexParams, SceneIndex};
+use setloc_sfm::synthetic::normal;
+use setloc_sfm::{
+    CameraId, ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint, Rigid,
+    Similarity,
+};
+
+use crate::{QueryPhoto, Scene};
+
+const NOISE_PX: f64 = 0.5;
+const VISIBLE: f64 = 35.0;
+const EXTENT: f64 = 0.3;
+
+/// Points with their descriptors.
+pub(crate) struct Place {
+    positions: Vec<Vector3<f64>>,
+    descriptors: Vec<Vec<u8>>,
+}
+
+/// What a camera sees: features, and which point each shows (`None` is clutter).
+pub(crate) struct View {
+    pub features: ImageFeatures,
+    pub shows: Vec<Option<usize>>,
+    pub pose: Rigid,
+}
+
+fn random_descriptor(rng: &mut ChaCha8Rng) -> Vec<u8> {
+    (0..DESCRIPTOR_LEN).map(|_| rng.random_range(0..120)).collect()
+}
+
+impl Place {
+    /// Two walls 16 units apart along a street of 130 units, y down.
+    pub(crate) fn street(points: usize, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let positions = (0..points)
+            .map(|_| {
+                let side = if rng.random() { 1.0 } else { -1.0 };
+                let relief = rng.random_range(-1.0..1.0);
+                Vector3::new(side * 8.0 + relief, rng.random_range(-7.0..2.0), rng.random_range(-10.0..120.0))
+            })
+            .collect();
+        let descriptors = (0..points).map(|_| random_descriptor(&mut rng)).collect();
+        Self { positions, descriptors }
+    }
+
+    /// Another place of the same details: every point looks like some point of this place, at random.
+    pub(crate) fn shuffled(mut self, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        for i in (1..self.descriptors.len()).rev() {
+            self.descriptors.swap(i, rng.random_range(0..=i));
+        }
+        self
+    }
+
+    /// Renders one view: `outliers` is the share of features that look like other points, `change` the illumination's
+    /// effect on descriptors.
+    pub(crate) fn view(&self, camera: &Camera, pose: Rigid, outliers: f64, change: i16, seed: u64) -> View {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut features = ImageFeatures { width: camera.width, height: camera.height, ..Default::default() };
+        let mut shows = Vec::new();
+        for (i, position) in self.positions.iter().enumerate() {
+            let in_camera = pose.inverse_transform_point(position);
+            let distance = in_camera.norm();
+            let Some(pixel) = camera.project(&in_camera).filter(|_| distance < VISIBLE && distance > 2.0)
+            else {
+                continue;
+            };
+            let noise = Vector2::new(normal(&mut rng), normal(&mut rng)) * NOISE_PX;
+            let seen = pixel + noise;
+            let (width, height) = (f64::from(camera.width), f64::from(camera.height));
+            let inside = seen.x > 0.0 && seen.y > 0.0 && seen.x < width && seen.y < height;
+            if !inside || rng.random_bool(0.15) {
+                continue;
+            }
+            let angle = camera.pixel_angle(&seen).unwrap();
+            let wrong = rng.random_bool(outliers);
+            let source = if wrong { rng.random_range(0..self.positions.len()) } else { i };
+            features.keypoints.push(Keypoint {
+                x: seen.x as f32,
+                y: seen.y as f32,
+                size: (EXTENT / distance / angle) as f32,
+                orientation: 0.0,
+                noise_px: NOISE_PX as f32,
+            });
+            features.colors.push([128; 3]);
+            let changed =
+                |&value: &u8| (i16::from(value) + rng.random_range(-change..=change)).clamp(0, 255) as u8;
+            features.descriptors.extend(self.descriptors[source].iter().map(changed));
+            shows.push((!wrong).then_some(i));
+        }
+        View { features, shows, pose }
+    }
+}
+
+/// Model of views: a point for each place point that two views show (second: which), positions and poses true.
+fn model_of(place: &Place, views: &[View], camera: &Camera) -> (Reconstruction, Vec<usize>) {
+    let mut tracks: Vec<Vec<Observation>> = vec![Vec::new(); place.positions.len()];
+    for (image, view) in views.iter().enumerate() {
+        for (feature, shown) in view.shows.iter().enumerate() {
+            if let Some(point) = shown {
+                tracks[*point].push(Observation { image: ImageId(image as u32), feature: feature as u32 });
+            }
+        }
+    }
+    let image = |(i, view): (usize, &View)| ReconstructionImage {
+        name: format!("{i}"),
+        camera: CameraId(0),
+        world_from_camera: Some(view.pose),
+    };
+    let point = |(i, track): (usize, Vec<Observation>)| ReconstructionPoint {
+        position: place.positions[i],
+        color: [128; 3],
+        error_sigma: 1.0,
+        track,
+    };
+    let shown: Vec<usize> = (0..tracks.len()).filter(|&i| tracks[i].len() >= 2).collect();
+    let model = Reconstruction {
+        cameras: vec![camera.clone()],
+        images: views.iter().enumerate().map(image).collect(),
+        points: tracks.into_iter().enumerate().filter(|(_, track)| track.len() >= 2).map(point).collect(),
+    };
+    (model, shown)
+}
+
+/// Panoramas, their model and index; a chain of photos and their local model.
+pub(crate) struct World {
+    /// Which point of the place each scene point is.
+    scene_points: Vec<usize>,
+    panoramas: Vec<View>,
+    pub scene_model: Reconstruction,
+    pub index: SceneIndex,
+    pub camera: Camera,
+    pub photos: Vec<View>,
+    pub names: Vec<String>,
+    /// Local model in its own frame.
+    pub local: Reconstruction,
+}
+
+pub(crate) fn pinhole() -> Camera {
+    Camera { model: CameraModel::Pinhole, width: 1200, height: 900, params: vec![800.0, 800.0, 600.0, 450.0] }
+}
+
+/// A pose at `center` that looks along the street, turned by `yaw` about the vertical.
+pub(crate) fn along_street(center: Vector3<f64>, yaw: f64) -> Rigid {
+    Rigid::new(UnitQuaternion::from_axis_angle(&Vector3::y_axis(), yaw), center)
+}
+
+impl World {
+    /// The usual world: eight panoramas, then photos every six units from z = 20 on.
+    pub(crate) fn chain(photos: usize, outliers: f64, seed: u64) -> Self {
+        Self::chain_in(&Place::street(3500, seed), photos, outliers, seed)
+    }
+
+    pub(crate) fn chain_in(place: &Place, photos: usize, outliers: f64, seed: u64) -> Self {
+        let poses: Vec<Rigid> = (0..photos)
+            .map(|i| {
+                along_street(
+                    Vector3::new(0.7 * (i % 3) as f64, -1.5, 20.0 + 6.0 * i as f64),
+                    0.05 * (i % 2) as f64,
+                )
+            })
+            .collect();
+        Self::new(place, &poses, outliers, seed)
+    }
+
+    pub(crate) fn new(place: &Place, poses: &[Rigid], outliers: f64, seed: u64) -> Self {
+        let panorama = Camera::equirectangular(3000, 1500);
+        let panoramas: Vec<View> = (0..8)
+            .map(|i| {
+                let pose = along_street(Vector3::new(0.3, -2.0, 4.0 * f64::from(i)), 0.8 * f64::from(i));
+                place.view(&panorama, pose, 0.0, 8, seed * 1000 + i as u64)
+            })
+            .collect();
+        let (mut scene_model, scene_points) = model_of(place, &panoramas, &panorama);
+        let features: Vec<&ImageFeatures> = panoramas.iter().map(|view| &view.features).collect();
+        let index = SceneIndex::build(&IndexParams::default(), &scene_model, &features);
+        // Scene points are as wrong as the panoramas' pixel noise leaves them.
+        let mut rng = ChaCha8Rng::seed_from_u64(seed * 1000 + 99);
+        for (i, point) in scene_model.points.iter_mut().enumerate() {
+            let factor = index.position_covariance(PointId(i as u32)).cholesky().unwrap().l();
+            point.position += factor * Vector3::from_fn(|_, _| normal(&mut rng));
+        }
+        let index = SceneIndex::build(&IndexParams::default(), &scene_model, &features);
+        let camera = pinhole();
+        let photos: Vec<View> = poses
+            .iter()
+            .enumerate()
+            .map(|(i, &pose)| place.view(&camera, pose, outliers, 20, seed * 1000 + 100 + i as u64))
+            .collect();
+        let world_from_set = Similarity {
+            scale: 2.5,
+            rotation: UnitQuaternion::from_euler_angles(0.4, 1.1, -0.3),
+            translation: Vector3::new(4.0, -3.0, 25.0),
+        };
+        let (mut local, _) = model_of(place, &photos, &camera);
+        local.transform(&world_from_set.inverse());
+        let names = (0..photos.len()).map(|i| format!("photo_{i:02}")).collect();
+        Self { scene_points, panoramas, scene_model, index, camera, photos, names, local }
+    }
+
+    /// Bends the local model: each photo, with the points it is the first to see, is turned by `angle` and stretched
+    /// by `stretch` against the one before.
+    pub(crate) fn bend(&mut self, angle: f64, stretch: f64) {
+        let poses: Vec<Rigid> =
+            self.local.images.iter().map(|image| image.world_from_camera.unwrap()).collect();
+        let mut drift = vec![Similarity::identity()];
+        for i in 1..poses.len() {
+            let at = poses[i - 1].translation;
+            let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), angle);
+            let scale = 1.0 + stretch;
+            let here = Similarity { scale, rotation: turn, translation: at - turn * at * scale };
+            drift.push(drift[i - 1] * here);
+        }
+        for (image, drift) in self.local.images.iter_mut().zip(&drift) {
+            image.world_from_camera = image.world_from_camera.map(|pose| drift.transform_pose(&pose));
+        }
+        for point in &mut self.local.points {
+            point.position = drift[point.track[0].image.index()].transform_point(&point.position);
+        }
+    }
+
+    /// Makes a scene whose points, by turns, stand where they are and `offset` away: two equal halves of evidence.
+    ///
+    /// Every second scene point is moved to its twin's place, so that the photos' matches support both places alike.
+    pub(crate) fn split_scene(&mut self, offset: Vector3<f64>) {
+        for point in self.scene_model.points.iter_mut().step_by(2) {
+            point.position += offset;
+        }
+        let features: Vec<&ImageFeatures> = self.panoramas.iter().map(|view| &view.features).collect();
+        self.index = SceneIndex::build(&IndexParams::default(), &self.scene_model, &features);
+    }
+
+    pub(crate) fn scene(&self) -> Scene<'_> {
+        Scene { reconstruction: &self.scene_model, index: &self.index }
+    }
+
+    pub(crate) fn queries(&self) -> Vec<QueryPhoto<'_>> {
+        self.photos
+            .iter()
+            .zip(&self.names)
+            .map(|(view, name)| QueryPhoto {
+                name,
+                camera: &self.camera,
+                camera_fixed: true,
+                features: &view.features,
+            })
+            .collect()
+    }
+
+    /// Centre error in scene units and rotation error in degrees.
+    pub(crate) fn errors(&self, photo: usize, pose: &Rigid) -> (f64, f64) {
+        let truth = &self.photos[photo].pose;
+        ((pose.translation - truth.translation).norm(), pose.rotation.angle_to(&truth.rotation).to_degrees())
+    }
+
+    /// How many features of a photo show a point of the scene.
+    pub(crate) fn shared_with_scene(&self, photo: usize) -> usize {
+        let shows = self.photos[photo].shows.iter().flatten();
+        shows.filter(|point| self.scene_points.binary_search(point).is_ok()).count()
+    }
+}

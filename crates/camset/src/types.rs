@@ -1,0 +1,90 @@
+use nalgebra::Matrix6;
+use serde::{Deserialize, Serialize};
+use setloc_features::{Camera, ImageFeatures};
+use setloc_index::SceneIndex;
+use setloc_sfm::{Reconstruction, Rigid, Similarity};
+
+use crate::PathToScene;
+
+/// A built scene, borrowed.
+#[derive(Debug, Clone, Copy)]
+pub struct Scene<'a> {
+    /// The scene's model (its largest component).
+    pub reconstruction: &'a Reconstruction,
+    /// Its searchable descriptors.
+    pub index: &'a SceneIndex,
+}
+
+/// One photo to localize.
+#[derive(Debug, Clone, Copy)]
+pub struct QueryPhoto<'a> {
+    /// Name as the user knows it.
+    pub name: &'a str,
+    /// Its camera; a guess when `camera_fixed` is false.
+    pub camera: &'a Camera,
+    /// Whether the intrinsics are known.
+    pub camera_fixed: bool,
+    /// Its features.
+    pub features: &'a ImageFeatures,
+}
+
+/// The answer in one word.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// The pose is supported well enough to be used.
+    Localized,
+    /// There is a pose, but it may be wrong or imprecise; the reasons say why.
+    Uncertain,
+    /// There is no pose.
+    NotLocalized,
+}
+
+/// Where one photo is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PhotoLocalization {
+    /// Name as the user knows it.
+    pub name: String,
+    /// The camera, with intrinsics refined when they were not known.
+    pub camera: Camera,
+    /// Pose in the scene's frame, `None` when not localized.
+    pub world_from_camera: Option<Rigid>,
+    /// Covariance of the pose: rotation (rad, in the camera frame), then centre (scene units, in the scene frame).
+    pub covariance: Option<Matrix6<f64>>,
+    /// Observations of scene points that support the pose.
+    pub inliers: usize,
+    /// The answer in one word.
+    pub verdict: Verdict,
+    /// Why, in sentences.
+    pub reasons: Vec<String>,
+}
+
+impl PhotoLocalization {
+    /// The answer "not localized", for one reason.
+    pub fn not_localized(photo: &QueryPhoto<'_>, reason: impl Into<String>) -> Self {
+        Self {
+            name: photo.name.to_owned(),
+            camera: photo.camera.clone(),
+            world_from_camera: None,
+            covariance: None,
+            inliers: 0,
+            verdict: Verdict::NotLocalized,
+            reasons: vec![reason.into()],
+        }
+    }
+}
+
+/// Where the photos of a set are.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct SetLocalization {
+    /// Pose of the rigid camera set, one entry a photo ("camset").
+    pub rigid: Vec<PhotoLocalization>,
+    /// Poses after the joint refinement, one entry a photo ("camset+opt").
+    pub refined: Vec<PhotoLocalization>,
+    /// Scene from local model, one per used component.
+    pub world_from_set: Vec<Similarity>,
+    /// The strongest way from the scene to each photo, one entry a photo.
+    pub paths: Vec<PathToScene>,
+    /// What happened to each local model, the weakest links and which photo to take next, in sentences.
+    pub advice: Vec<String>,
+}
