@@ -8,8 +8,13 @@
 pub mod artifacts;
 pub mod clock;
 pub mod codec;
+pub mod config;
+pub mod dataset;
 pub mod error;
 pub mod fingerprint;
+pub mod geodesy;
 pub mod graph;
+pub mod jobs;
+pub mod scene;
 pub mod stages;
 pub mod store;

@@ -86,6 +86,14 @@ mod shim {
     /// Image mask.
     pub struct Mask;
 
+    /// Reads a mask image.
+    ///
+    /// # Errors
+    /// When the bytes are no image.
+    pub fn read_mask(bytes: &[u8]) -> Result<Mask, image::ImageError> {
+        image::load_from_memory(bytes).map(|_| Mask)
+    }
+
     /// Decodes an image.
     ///
     /// # Errors
