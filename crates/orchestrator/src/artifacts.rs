@@ -34,9 +34,12 @@ impl Artifact for ImageFeatures {
         let wrong = || CodecError::Payload("feature blocks of a wrong length".to_owned());
         let (head, rest) = payload.split_at_checked(16).ok_or_else(wrong)?;
         let number = |bytes: &[u8]| bytes.iter().rev().fold(0_u64, |sum, &byte| (sum << 8) | u64::from(byte));
-        let (width, height, count) = (number(&head[..4]) as u32, number(&head[4..8]) as u32, number(&head[8..]) as usize);
-        let (keypoints, rest) = count.checked_mul(20).and_then(|n| rest.split_at_checked(n)).ok_or_else(wrong)?;
-        let (colors, descriptors) = count.checked_mul(3).and_then(|n| rest.split_at_checked(n)).ok_or_else(wrong)?;
+        let (width, height, count) =
+            (number(&head[..4]) as u32, number(&head[4..8]) as u32, number(&head[8..]) as usize);
+        let (keypoints, rest) =
+            count.checked_mul(20).and_then(|n| rest.split_at_checked(n)).ok_or_else(wrong)?;
+        let (colors, descriptors) =
+            count.checked_mul(3).and_then(|n| rest.split_at_checked(n)).ok_or_else(wrong)?;
         if count.checked_mul(setloc_features::DESCRIPTOR_LEN) != Some(descriptors.len()) {
             return Err(wrong());
         }

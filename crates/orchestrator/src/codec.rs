@@ -88,7 +88,8 @@ pub enum CodecError {
 /// # Errors
 /// [`CodecError::Encode`] when a value cannot be written.
 pub fn to_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
-    bincode::serde::encode_to_vec(value, bincode::config::standard()).map_err(|e| CodecError::Encode(e.to_string()))
+    bincode::serde::encode_to_vec(value, bincode::config::standard())
+        .map_err(|e| CodecError::Encode(e.to_string()))
 }
 
 /// Bytes to serde value; all bytes must be used.
@@ -98,7 +99,11 @@ pub fn to_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
 pub fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
     let (value, used) = bincode::serde::decode_from_slice(bytes, bincode::config::standard())
         .map_err(|e| CodecError::Payload(e.to_string()))?;
-    if used == bytes.len() { Ok(value) } else { Err(CodecError::Payload(format!("{} bytes left over", bytes.len() - used))) }
+    if used == bytes.len() {
+        Ok(value)
+    } else {
+        Err(CodecError::Payload(format!("{} bytes left over", bytes.len() - used)))
+    }
 }
 
 /// The whole file of an artifact.
@@ -140,7 +145,8 @@ pub fn decode<T: Artifact>(file: &[u8]) -> Result<T, CodecError> {
 fn split(file: &[u8]) -> Result<(&[u8], u32, &[u8], &[u8]), CodecError> {
     let mut rest = file;
     let mut take = |count: usize| {
-        let (head, tail) = rest.split_at_checked(count).ok_or(CodecError::Header("it ends within its header"))?;
+        let (head, tail) =
+            rest.split_at_checked(count).ok_or(CodecError::Header("it ends within its header"))?;
         rest = tail;
         Ok::<_, CodecError>(head)
     };

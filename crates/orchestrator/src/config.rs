@@ -59,9 +59,11 @@ impl Config {
     pub fn resolve(file: Option<&Path>, settings: &[String]) -> Result<Self> {
         let mut table = match file {
             Some(path) => {
-                let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+                let text = std::fs::read_to_string(path)
+                    .with_context(|| format!("cannot read {}", path.display()))?;
                 // Checked on its own first, so that the error shows the line in the file.
-                toml::from_str::<Self>(&text).with_context(|| format!("{} is not a valid configuration", path.display()))?;
+                toml::from_str::<Self>(&text)
+                    .with_context(|| format!("{} is not a valid configuration", path.display()))?;
                 toml::from_str::<toml::Table>(&text)?
             }
             None => toml::Table::new(),
@@ -126,7 +128,10 @@ mod tests {
         let path = folder.path().join("setloc.toml");
         std::fs::write(&path, "[pairs]\nwindw = 3\n").unwrap();
         let error = format!("{:#}", Config::resolve(Some(&path), &[]).unwrap_err());
-        assert!(error.contains("setloc.toml") && error.contains("line 2") && error.contains("window"), "{error}");
+        assert!(
+            error.contains("setloc.toml") && error.contains("line 2") && error.contains("window"),
+            "{error}"
+        );
         assert!(Config::resolve(None, &["pairs.windw=3".to_owned()]).is_err());
         assert!(Config::resolve(None, &["pairs.window=many".to_owned()]).is_err());
     }

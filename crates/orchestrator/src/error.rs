@@ -16,7 +16,10 @@ impl Hinted {
     }
 
     /// A new error with a hint.
-    pub fn new(message: impl fmt::Display + fmt::Debug + Send + Sync + 'static, hint: impl Into<String>) -> anyhow::Error {
+    pub fn new(
+        message: impl fmt::Display + fmt::Debug + Send + Sync + 'static,
+        hint: impl Into<String>,
+    ) -> anyhow::Error {
         Self::wrap(anyhow::Error::msg(message), hint)
     }
 

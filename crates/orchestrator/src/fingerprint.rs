@@ -39,7 +39,9 @@ impl TryFrom<String> for ContentHash {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, Self::Error> {
-        blake3::Hash::from_hex(&text).map(|hash| Self(*hash.as_bytes())).map_err(|e| format!("`{text}` is no content hash: {e}"))
+        blake3::Hash::from_hex(&text)
+            .map(|hash| Self(*hash.as_bytes()))
+            .map_err(|e| format!("`{text}` is no content hash: {e}"))
     }
 }
 
@@ -73,7 +75,10 @@ impl Fingerprint {
     pub fn changes_since(&self, before: &Self) -> Vec<String> {
         let mut changes = Vec::new();
         if self.version != before.version {
-            changes.push(format!("the code of `{}` changed from version {} to {}", self.kind, before.version, self.version));
+            changes.push(format!(
+                "the code of `{}` changed from version {} to {}",
+                self.kind, before.version, self.version
+            ));
         }
         diff_values("", &before.params, &self.params, &mut changes);
         for (role, hash) in &self.inputs {

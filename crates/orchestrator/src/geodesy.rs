@@ -69,7 +69,11 @@ mod tests {
     #[test]
     fn round_trip_is_exact() {
         let origin = Wgs84 { lat: 48.8566, lon: 2.3522, alt: 35.0 };
-        for enu in [Vector3::new(0.0, 0.0, 0.0), Vector3::new(120.0, -340.0, 12.0), Vector3::new(-4000.0, 9000.0, -30.0)] {
+        for enu in [
+            Vector3::new(0.0, 0.0, 0.0),
+            Vector3::new(120.0, -340.0, 12.0),
+            Vector3::new(-4000.0, 9000.0, -30.0),
+        ] {
             let back = Wgs84::from_enu(&enu, origin).to_enu(origin);
             assert!((back - enu).norm() < 1e-6, "{enu} {back}");
         }

@@ -120,7 +120,10 @@ mod shim {
         }
         let (w, h) = (f64::from(info.width), f64::from(info.height));
         let params = vec![1.2 * w.max(h), w / 2.0, h / 2.0, 0.0];
-        (Camera { model: CameraModel::SimpleRadial, width: info.width, height: info.height, params }, CameraSource::Guess)
+        (
+            Camera { model: CameraModel::SimpleRadial, width: info.width, height: info.height, params },
+            CameraSource::Guess,
+        )
     }
 
     /// Detects and describes.
@@ -137,7 +140,11 @@ mod shim {
     }
 
     /// Matches two images.
-    pub fn match_features(_params: &MatchParams, _first: &ImageFeatures, _second: &ImageFeatures) -> Vec<Match> {
+    pub fn match_features(
+        _params: &MatchParams,
+        _first: &ImageFeatures,
+        _second: &ImageFeatures,
+    ) -> Vec<Match> {
         Vec::new()
     }
 }

@@ -93,7 +93,10 @@ impl Store {
     pub fn read(&self, hash: ContentHash) -> Result<Vec<u8>> {
         let path = self.object_path(hash);
         let bytes = fs::read(&path).with_context(|| format!("cannot read artifact {hash}"))?;
-        anyhow::ensure!(ContentHash::of(&bytes) == hash, "artifact {hash} is damaged: its content has another hash");
+        anyhow::ensure!(
+            ContentHash::of(&bytes) == hash,
+            "artifact {hash} is damaged: its content has another hash"
+        );
         Ok(bytes)
     }
 
@@ -108,8 +111,12 @@ impl Store {
         if !whole {
             write_atomically(&path, file)?;
         }
-        let record = KeyRecord { fingerprint: fingerprint.clone(), output, bytes: file.len() as u64, cpu_secs };
-        write_atomically(&self.key_path(fingerprint.key()), serde_json::to_string_pretty(&record)?.as_bytes())?;
+        let record =
+            KeyRecord { fingerprint: fingerprint.clone(), output, bytes: file.len() as u64, cpu_secs };
+        write_atomically(
+            &self.key_path(fingerprint.key()),
+            serde_json::to_string_pretty(&record)?.as_bytes(),
+        )?;
         Ok(output)
     }
 
@@ -129,7 +136,11 @@ impl Store {
     ///
     /// # Errors
     /// When the disk is full or not writable.
-    pub fn remember_run(&self, name: &str, jobs: std::collections::BTreeMap<String, ContentHash>) -> Result<()> {
+    pub fn remember_run(
+        &self,
+        name: &str,
+        jobs: std::collections::BTreeMap<String, ContentHash>,
+    ) -> Result<()> {
         let last = self.run(name);
         if last.jobs == jobs {
             return Ok(());
@@ -154,7 +165,8 @@ impl Store {
     }
 
     fn run_path(&self, name: &str) -> PathBuf {
-        let name: String = name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect();
+        let name: String =
+            name.chars().map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect();
         self.root.join("runs").join(format!("{name}.json"))
     }
 
@@ -198,7 +210,8 @@ impl Store {
         let mut damaged = Vec::new();
         for path in files_below(&self.root.join("objects"))? {
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default().to_owned();
-            if fs::read(&path).map(|bytes| ContentHash::of(&bytes).to_string()).ok().as_deref() != Some(&name) {
+            if fs::read(&path).map(|bytes| ContentHash::of(&bytes).to_string()).ok().as_deref() != Some(&name)
+            {
                 fs::remove_file(&path).map_err(|e| write_error(e, &path))?;
                 damaged.push(name);
             }
@@ -272,7 +285,8 @@ fn files_below(folder: &Path) -> Result<Vec<PathBuf>> {
         if shard.is_dir() {
             for entry in fs::read_dir(&shard)? {
                 let path = entry?.path();
-                let hidden = path.file_name().and_then(|name| name.to_str()).is_none_or(|name| name.starts_with('.'));
+                let hidden =
+                    path.file_name().and_then(|name| name.to_str()).is_none_or(|name| name.starts_with('.'));
                 if !hidden {
                     files.push(path);
                 }
@@ -328,7 +342,12 @@ mod tests {
     use super::*;
 
     fn fingerprint(version: u32) -> Fingerprint {
-        Fingerprint { kind: "test".to_owned(), version, params: serde_json::json!({}), inputs: BTreeMap::new() }
+        Fingerprint {
+            kind: "test".to_owned(),
+            version,
+            params: serde_json::json!({}),
+            inputs: BTreeMap::new(),
+        }
     }
 
     #[test]

@@ -30,7 +30,8 @@ impl CameraBook {
     pub fn read(path: &Path) -> Result<Self> {
         let shown = path.display();
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {shown}"))?;
-        let file: CamerasFile = serde_json::from_str(&text).with_context(|| format!("{shown} is no cameras.json"))?;
+        let file: CamerasFile =
+            serde_json::from_str(&text).with_context(|| format!("{shown} is no cameras.json"))?;
         for (name, camera) in &file.cameras {
             camera.validate().with_context(|| format!("{shown}: camera `{name}`"))?;
         }
@@ -38,7 +39,9 @@ impl CameraBook {
         for (image, name) in file.images {
             let known = || file.cameras.keys().cloned().collect::<Vec<_>>().join(", ");
             let camera = file.cameras.get(&name);
-            let camera = camera.with_context(|| format!("{shown}: image `{image}` has camera `{name}`, known are: {}", known()))?;
+            let camera = camera.with_context(|| {
+                format!("{shown}: image `{image}` has camera `{name}`, known are: {}", known())
+            })?;
             by_image.insert(image, camera.clone());
         }
         Ok(Self { by_image })

@@ -42,7 +42,10 @@ impl GeoBook {
             };
             if !place.is_valid() {
                 let message = format!("{shown}, line {}: `{line}` is no position", at + 1);
-                return Err(Hinted::new(message, "each line is name,lat,lon,alt in WGS84 degrees and metres"));
+                return Err(Hinted::new(
+                    message,
+                    "each line is name,lat,lon,alt in WGS84 degrees and metres",
+                ));
             }
             by_image.insert(fields[0].to_owned(), place);
         }

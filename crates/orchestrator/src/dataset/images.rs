@@ -63,7 +63,8 @@ pub fn list_images(paths: &[PathBuf]) -> Result<Vec<(String, PathBuf)>> {
         if metadata.is_dir() {
             for entry in std::fs::read_dir(path).with_context(|| format!("cannot list {}", path.display()))? {
                 let entry = entry?.path();
-                let ending = entry.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase();
+                let ending =
+                    entry.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase();
                 if ENDINGS.contains(&ending.as_str()) && entry.is_file() {
                     files.push(entry);
                 }
@@ -102,7 +103,12 @@ impl ImageFolder {
     ///
     /// # Errors
     /// When not a single file is readable.
-    pub fn read(files: &[(String, PathBuf)], cameras: &CameraBook, geo: &GeoSource, masks: Option<&Path>) -> Result<Self> {
+    pub fn read(
+        files: &[(String, PathBuf)],
+        cameras: &CameraBook,
+        geo: &GeoSource,
+        masks: Option<&Path>,
+    ) -> Result<Self> {
         let table = match geo {
             GeoSource::Table(path) => GeoBook::read(path)?,
             GeoSource::None | GeoSource::Exif => GeoBook::default(),
@@ -110,7 +116,8 @@ impl ImageFolder {
         let read: Vec<Result<SourceImage, SkippedImage>> = files
             .par_iter()
             .map(|(name, path)| {
-                let skip = |error: anyhow::Error| SkippedImage { name: name.clone(), reason: format!("{error:#}") };
+                let skip =
+                    |error: anyhow::Error| SkippedImage { name: name.clone(), reason: format!("{error:#}") };
                 let mut image = read_image(name, path, cameras, geo).map_err(skip)?;
                 image.position = image.position.or_else(|| table.find(name));
                 image.mask = masks.map(|folder| find_mask(folder, path)).transpose().map_err(skip)?.flatten();
@@ -125,8 +132,10 @@ impl ImageFolder {
             }
         }
         if folder.images.is_empty() {
-            let reasons: Vec<String> = folder.skipped.iter().map(|s| format!("{}: {}", s.name, s.reason)).collect();
-            let message = format!("none of {} files is a readable image ({})", files.len(), reasons.join("; "));
+            let reasons: Vec<String> =
+                folder.skipped.iter().map(|s| format!("{}: {}", s.name, s.reason)).collect();
+            let message =
+                format!("none of {} files is a readable image ({})", files.len(), reasons.join("; "));
             return Err(Hinted::new(message, "check the files with an image viewer"));
         }
         Ok(folder)
@@ -137,7 +146,8 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
     let bytes = std::fs::read(path)?;
     anyhow::ensure!(!bytes.is_empty(), "the file is empty");
     let info = stages::probe(&bytes).context("not a readable image")?;
-    let known = cameras.find(name).filter(|camera| (camera.width, camera.height) == (info.width, info.height));
+    let known =
+        cameras.find(name).filter(|camera| (camera.width, camera.height) == (info.width, info.height));
     let (camera, camera_fixed, camera_source) = match known {
         Some(camera) => (camera.clone(), true, "cameras.json".to_owned()),
         None => {
@@ -147,17 +157,30 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
         }
     };
     let exif = (*geo == GeoSource::Exif).then_some(info.metadata.gps).flatten();
-    let position = exif.map(|gps| Wgs84 { lat: gps.lat_deg, lon: gps.lon_deg, alt: gps.alt_m.unwrap_or(0.0) });
+    let position =
+        exif.map(|gps| Wgs84 { lat: gps.lat_deg, lon: gps.lon_deg, alt: gps.alt_m.unwrap_or(0.0) });
     let position = position.filter(|place| place.is_valid());
     let hash = ContentHash::of(&bytes);
-    Ok(SourceImage { name: name.to_owned(), path: path.to_owned(), hash, camera, camera_fixed, camera_source, position, mask: None })
+    Ok(SourceImage {
+        name: name.to_owned(),
+        path: path.to_owned(),
+        hash,
+        camera,
+        camera_fixed,
+        camera_source,
+        position,
+        mask: None,
+    })
 }
 
 /// `<folder>/<file>.png`, as COLMAP names masks, or `<folder>/<stem>.png`.
 fn find_mask(folder: &Path, image: &Path) -> Result<Option<(PathBuf, ContentHash)>> {
     let file = image.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let stem = image.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    let path = [format!("{file}.png"), format!("{stem}.png")].map(|name| folder.join(name)).into_iter().find(|p| p.is_file());
+    let path = [format!("{file}.png"), format!("{stem}.png")]
+        .map(|name| folder.join(name))
+        .into_iter()
+        .find(|p| p.is_file());
     path.map(|path| {
         let bytes = std::fs::read(&path).with_context(|| format!("cannot read mask {}", path.display()))?;
         Ok((path, ContentHash::of(&bytes)))

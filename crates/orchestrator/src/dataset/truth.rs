@@ -32,7 +32,8 @@ impl Truth {
     /// # Errors
     /// With file and line.
     pub fn read(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let text =
+            std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
         serde_json::from_str(&text).with_context(|| format!("{} is no truth.json", path.display()))
     }
 
@@ -40,7 +41,10 @@ impl Truth {
     pub fn pose(&self, name: &str) -> Option<Rigid> {
         self.images.get(name).map(|pose| {
             let [w, x, y, z] = pose.q_wxyz;
-            Rigid::new(UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)), Vector3::from(pose.center))
+            Rigid::new(
+                UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)),
+                Vector3::from(pose.center),
+            )
         })
     }
 

@@ -103,7 +103,8 @@ impl<'a> Executor<'a> {
                 dependencies_left: graph.uses(id).count(),
             })
             .collect();
-        let ready = graph.graph.node_indices().filter(|id| slots[id.index()].dependencies_left == 0).collect();
+        let ready =
+            graph.graph.node_indices().filter(|id| slots[id.index()].dependencies_left == 0).collect();
         let shared = Shared { slots, ready, in_flight: 0, memory_in_flight: 0, fatal: None };
         Self {
             graph,
@@ -160,7 +161,8 @@ impl<'a> Executor<'a> {
                 return;
             }
             let fits = |id: &JobId| {
-                shared.in_flight == 0 || shared.memory_in_flight + self.graph.job(*id).memory <= self.options.memory
+                shared.in_flight == 0
+                    || shared.memory_in_flight + self.graph.job(*id).memory <= self.options.memory
             };
             let Some(id) = shared.ready.iter().copied().find(fits) else { return };
             shared.ready.remove(&id);
@@ -218,7 +220,11 @@ impl<'a> Executor<'a> {
             Ok(output) => (State::Ran, Some(key), Some(output)),
             Err(error) => {
                 let reason = format!("{error:#}");
-                self.options.observer.notice(&Event::Failed { kind: job.kind, job: job.name.clone(), reason: reason.clone() });
+                self.options.observer.notice(&Event::Failed {
+                    kind: job.kind,
+                    job: job.name.clone(),
+                    reason: reason.clone(),
+                });
                 (State::Failed(reason), Some(key), None)
             }
         }
@@ -249,7 +255,8 @@ impl<'a> Executor<'a> {
             .unwrap_or_else(|_| Err(anyhow::anyhow!("the job panicked: this is a bug")));
         // A job that ran alone may have used all cores: the process's time is its own.
         let alone = alone && self.started.load(Ordering::SeqCst) == ticket + 1;
-        let cpu_secs = if alone { clock::process_cpu_secs() - process } else { clock::thread_cpu_secs() - thread };
+        let cpu_secs =
+            if alone { clock::process_cpu_secs() - process } else { clock::thread_cpu_secs() - thread };
         self.running.fetch_sub(1, Ordering::SeqCst);
         let product = product?;
         let output = match self.options.store.write(fingerprint, &product.file, cpu_secs) {
@@ -269,7 +276,14 @@ impl<'a> Executor<'a> {
         }
         let job = job.name.clone();
         let kind = self.graph.job(id).kind;
-        self.options.observer.notice(&Event::Finished { kind, job, started_secs, wall_secs, cpu_secs, bytes });
+        self.options.observer.notice(&Event::Finished {
+            kind,
+            job,
+            started_secs,
+            wall_secs,
+            cpu_secs,
+            bytes,
+        });
         Ok(output)
     }
 
@@ -314,7 +328,12 @@ impl<'a> Executor<'a> {
     }
 
     /// Makes a result again whose file cannot be used.
-    fn remake(&self, id: JobId, output: ContentHash, error: &anyhow::Error) -> Result<Arc<dyn Any + Send + Sync>> {
+    fn remake(
+        &self,
+        id: JobId,
+        output: ContentHash,
+        error: &anyhow::Error,
+    ) -> Result<Arc<dyn Any + Send + Sync>> {
         let label = self.graph.job(id).label();
         let text = format!("the stored result of {label} cannot be used and is made again: {error:#}");
         self.options.observer.notice(&Event::Warning { text });

@@ -113,7 +113,12 @@ impl<'a> JobGraph<'a> {
             dot += &format!("  {} [label={:?}];\n", id.index(), self.graph[id].label());
         }
         for edge in self.graph.edge_references() {
-            dot += &format!("  {} -> {} [label={:?}];\n", edge.source().index(), edge.target().index(), edge.weight().role);
+            dot += &format!(
+                "  {} -> {} [label={:?}];\n",
+                edge.source().index(),
+                edge.target().index(),
+                edge.weight().role
+            );
         }
         dot + "}\n"
     }
@@ -139,7 +144,8 @@ impl Inputs<'_, '_> {
     /// # Errors
     /// When there is none, or it can neither be read nor made again.
     pub fn get<T: Artifact>(&self, role: &str) -> Result<Arc<T>> {
-        self.find(role)?.with_context(|| format!("{} has no input {role}", self.executor.graph.job(self.id).label()))
+        self.find(role)?
+            .with_context(|| format!("{} has no input {role}", self.executor.graph.job(self.id).label()))
     }
 
     /// The result in a role, or `None` when the job that makes it failed.
@@ -147,7 +153,8 @@ impl Inputs<'_, '_> {
     /// # Errors
     /// When it can neither be read nor made again.
     pub fn find<T: Artifact>(&self, role: &str) -> Result<Option<Arc<T>>> {
-        let used = self.executor.graph.uses(self.id).find(|(_, edge)| edge.role == role).map(|(used, _)| used);
+        let used =
+            self.executor.graph.uses(self.id).find(|(_, edge)| edge.role == role).map(|(used, _)| used);
         match used {
             Some(used) if self.executor.output(used).is_some() => self.executor.load(used).map(Some),
             _ => Ok(None),

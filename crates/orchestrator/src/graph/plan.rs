@@ -50,8 +50,12 @@ impl JobGraph<'_> {
                     None => waits_for.push(format!("uses {}", self.job(used).label())),
                 }
             }
-            let fingerprint =
-                Fingerprint { kind: job.kind.to_owned(), version: job.version, params: job.params.clone(), inputs };
+            let fingerprint = Fingerprint {
+                kind: job.kind.to_owned(),
+                version: job.version,
+                params: job.params.clone(),
+                inputs,
+            };
             let (prediction, reasons) = if waits_for.is_empty() {
                 match store.lookup(fingerprint.key()) {
                     Some(record) => {
@@ -72,7 +76,9 @@ impl JobGraph<'_> {
 
 fn why(now: &Fingerprint, label: &str, store: &Store, last: &RunRecord) -> Vec<String> {
     let Some(key) = last.jobs.get(label) else { return vec!["never ran before".to_owned()] };
-    let Some(before) = store.record(*key) else { return vec!["its last fingerprint is no longer kept".to_owned()] };
+    let Some(before) = store.record(*key) else {
+        return vec!["its last fingerprint is no longer kept".to_owned()];
+    };
     let changes = now.changes_since(&before.fingerprint);
     if changes.is_empty() { vec!["its result is no longer in the store".to_owned()] } else { changes }
 }

@@ -42,7 +42,12 @@ pub struct SetJobs {
 ///
 /// # Errors
 /// When parameters have no JSON form.
-pub fn add_set(graph: &mut JobGraph<'_>, name: &str, photos: &[SourceImage], what: &LocateJobs) -> Result<SetJobs> {
+pub fn add_set(
+    graph: &mut JobGraph<'_>,
+    name: &str,
+    photos: &[SourceImage],
+    what: &LocateJobs,
+) -> Result<SetJobs> {
     let positions = vec![None; photos.len()];
     let model = add_model(graph, ModelKind::Local, name, photos, &positions, &what.config, what.seed)?;
     let listed: Vec<_> = photos.iter().map(|p| json!([p.name, p.camera, p.camera_fixed])).collect();
@@ -74,7 +79,8 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
             features.push((photo, found));
         }
     }
-    let queries: Vec<QueryPhoto<'_>> = features.iter().map(|(photo, features)| query(photo, features)).collect();
+    let queries: Vec<QueryPhoto<'_>> =
+        features.iter().map(|(photo, features)| query(photo, features)).collect();
     let empty = Reconstruction::default();
     let scene = scene_of(&what.scene, &empty);
     let seed = derived_seed(what.seed, &["camset"]);
@@ -83,7 +89,12 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
 }
 
 /// Adds the localization of one photo alone, from its features.
-pub fn add_single(graph: &mut JobGraph<'_>, photo: &SourceImage, features: JobId, what: &LocateJobs) -> JobId {
+pub fn add_single(
+    graph: &mut JobGraph<'_>,
+    photo: &SourceImage,
+    features: JobId,
+    what: &LocateJobs,
+) -> JobId {
     let camera = json!([photo.name, photo.camera, photo.camera_fixed]);
     let params = json!({ "single": what.config.single, "seed": what.seed, "photo": camera });
     let (owned, what_here) = (photo.clone(), what.clone());

@@ -8,7 +8,9 @@ use anyhow::{Context, Result};
 use nalgebra::Vector3;
 use serde_json::json;
 use setloc_features::{Camera, ImageFeatures, Match};
-use setloc_sfm::{CameraId, ImageId, InputImage, MapperInput, PairGeometry, TwoView, reconstruct, verify_pair};
+use setloc_sfm::{
+    CameraId, ImageId, InputImage, MapperInput, PairGeometry, TwoView, reconstruct, verify_pair,
+};
 
 use super::{choose_pairs, derived_seed};
 use crate::artifacts::{PairMatches, VerifiedPair};
@@ -46,19 +48,22 @@ pub fn add_model(
     config: &Config,
     seed: u64,
 ) -> Result<ModelJobs> {
-    let features = images.iter().map(|image| add_features(graph, image, config)).collect::<Result<Vec<_>>>()?;
+    let features =
+        images.iter().map(|image| add_features(graph, image, config)).collect::<Result<Vec<_>>>()?;
     let mut pairs = Vec::new();
     for (a, b) in choose_pairs(&config.pairs, positions) {
         pairs.push((a, b, add_pair(graph, images, &features, (a, b), config, seed)?));
     }
     let cameras = share_cameras(images);
-    let placed: Vec<_> = cameras.of_image.iter().zip(positions).map(|(camera, position)| json!([camera, position])).collect();
+    let placed: Vec<_> =
+        cameras.of_image.iter().zip(positions).map(|(camera, position)| json!([camera, position])).collect();
     let params = json!({
         "sfm": config.sfm, "seed": seed, "images": placed, "cameras": cameras.cameras, "camera_fixed": cameras.fixed,
     });
     let mapper = config.sfm.clone();
     let positions = positions.to_vec();
-    let pair_list: Vec<(usize, usize, bool)> = pairs.iter().map(|&(a, b, _)| (a, b, is_swapped(images, a, b))).collect();
+    let pair_list: Vec<(usize, usize, bool)> =
+        pairs.iter().map(|&(a, b, _)| (a, b, is_swapped(images, a, b))).collect();
     let work = move |inputs: &Inputs<'_, '_>| {
         let input = ModelInput { cameras: &cameras, positions: &positions, pairs: &pair_list };
         run_model(inputs, &mapper, &input, seed)
@@ -103,7 +108,8 @@ fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, config: &Config) 
     // Decoded pixels, their grey float pyramid and the descriptors: about 24 bytes a pixel.
     let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 24;
     let params = json!({ "features": config.features, "camera": image.camera });
-    let (path, hash, camera, features) = (image.path.clone(), image.hash, image.camera.clone(), config.features.clone());
+    let (path, hash, camera, features) =
+        (image.path.clone(), image.hash, image.camera.clone(), config.features.clone());
     let work = move |_: &Inputs<'_, '_>| {
         let bytes = read_unchanged(&path, hash)?;
         let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
@@ -187,7 +193,8 @@ struct SharedCameras {
 fn share_cameras(images: &[SourceImage]) -> SharedCameras {
     let mut shared = SharedCameras { cameras: Vec::new(), fixed: Vec::new(), of_image: Vec::new() };
     for image in images {
-        let same = |at: &usize| shared.cameras[*at] == image.camera && shared.fixed[*at] == image.camera_fixed;
+        let same =
+            |at: &usize| shared.cameras[*at] == image.camera && shared.fixed[*at] == image.camera_fixed;
         let at = (0..shared.cameras.len()).find(same).unwrap_or_else(|| {
             shared.cameras.push(image.camera.clone());
             shared.fixed.push(image.camera_fixed);
@@ -204,7 +211,12 @@ struct ModelInput<'a> {
     pairs: &'a [(usize, usize, bool)],
 }
 
-fn run_model(inputs: &Inputs<'_, '_>, params: &setloc_sfm::MapperParams, input: &ModelInput<'_>, seed: u64) -> Result<Product> {
+fn run_model(
+    inputs: &Inputs<'_, '_>,
+    params: &setloc_sfm::MapperParams,
+    input: &ModelInput<'_>,
+    seed: u64,
+) -> Result<Product> {
     let mut features: Vec<(usize, Arc<ImageFeatures>)> = Vec::new();
     let mut id_of = BTreeMap::new();
     for at in 0..input.positions.len() {
@@ -249,7 +261,8 @@ pub(super) fn with_names(text: &str, names: &[String]) -> String {
     let mut parts = text.split('⟦');
     let mut out = parts.next().unwrap_or_default().to_owned();
     for part in parts {
-        let named = part.split_once('⟧').and_then(|(at, rest)| Some((names.get(at.parse::<usize>().ok()?)?, rest)));
+        let named =
+            part.split_once('⟧').and_then(|(at, rest)| Some((names.get(at.parse::<usize>().ok()?)?, rest)));
         match named {
             Some((name, rest)) => out.extend([name, rest]),
             None => out.extend(["⟦", part]),
@@ -260,7 +273,8 @@ pub(super) fn with_names(text: &str, names: &[String]) -> String {
 
 /// The same geometry with the two images exchanged.
 fn flip(two_view: &TwoView) -> TwoView {
-    let mut inliers: Vec<Match> = two_view.inliers.iter().map(|m| Match { first: m.second, second: m.first }).collect();
+    let mut inliers: Vec<Match> =
+        two_view.inliers.iter().map(|m| Match { first: m.second, second: m.first }).collect();
     inliers.sort_unstable();
     TwoView { second_from_first: two_view.second_from_first.inverse(), inliers, ..two_view.clone() }
 }

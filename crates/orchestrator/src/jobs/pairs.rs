@@ -16,7 +16,8 @@ pub fn choose_pairs(params: &PairParams, positions: &[Option<Vector3<f64>>]) -> 
         pairs.extend((a + 1..count.min(a + 1 + params.window)).map(|b| (a, b)));
         let Some(here) = positions[a] else { continue };
         let distance = |b: usize| positions[b].map(|there| (there - here).norm());
-        let mut near: Vec<(f64, usize)> = (0..count).filter(|&b| b != a).filter_map(|b| Some((distance(b)?, b))).collect();
+        let mut near: Vec<(f64, usize)> =
+            (0..count).filter(|&b| b != a).filter_map(|b| Some((distance(b)?, b))).collect();
         near.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
         pairs.extend(near.iter().take(params.nearest).map(|&(_, b)| (a.min(b), a.max(b))));
     }
@@ -36,7 +37,8 @@ mod tests {
     fn large_sets_grow_linearly() {
         let params = PairParams { exhaustive_up_to: 10, window: 2, nearest: 3 };
         let line = |n: usize| (0..n).map(|i| Some(Vector3::new(i as f64, 0.0, 0.0))).collect::<Vec<_>>();
-        let (small, large) = (choose_pairs(&params, &line(100)).len(), choose_pairs(&params, &line(200)).len());
+        let (small, large) =
+            (choose_pairs(&params, &line(100)).len(), choose_pairs(&params, &line(200)).len());
         assert!(large <= 2 * small + 10, "{small} {large}");
         assert!(choose_pairs(&params, &line(100)).iter().all(|(a, b)| a < b));
     }

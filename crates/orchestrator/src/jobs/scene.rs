@@ -28,7 +28,12 @@ pub struct SceneJobs {
 ///
 /// # Errors
 /// When parameters have no JSON form.
-pub fn add_scene(graph: &mut JobGraph<'_>, images: &[SourceImage], config: &Config, seed: u64) -> Result<SceneJobs> {
+pub fn add_scene(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    config: &Config,
+    seed: u64,
+) -> Result<SceneJobs> {
     let origin = origin_of(images);
     let positions: Vec<Option<Vector3<f64>>> =
         images.iter().map(|image| Some(image.position?.to_enu(origin?))).collect();
