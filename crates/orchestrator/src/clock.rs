@@ -26,3 +26,10 @@ pub fn peak_rss_mib() -> f64 {
     let unit = if cfg!(target_os = "macos") { 1024.0 * 1024.0 } else { 1024.0 };
     if status == 0 { usage.ru_maxrss as f64 / unit } else { 0.0 }
 }
+
+/// Memory of the machine in bytes; 4 GiB where the system does not say.
+pub fn physical_memory() -> u64 {
+    // SAFETY: sysconf only reads.
+    let (pages, size) = unsafe { (libc::sysconf(libc::_SC_PHYS_PAGES), libc::sysconf(libc::_SC_PAGESIZE)) };
+    if pages > 0 && size > 0 { pages as u64 * size as u64 } else { 4 << 30 }
+}

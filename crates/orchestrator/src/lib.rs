@@ -6,6 +6,9 @@
 //! nothing, and "why did this run?" is a comparison of two small JSON texts.
 
 pub mod artifacts;
+pub mod bench;
+pub mod building;
+pub mod cli;
 pub mod clock;
 pub mod codec;
 pub mod config;
@@ -16,6 +19,7 @@ pub mod fingerprint;
 pub mod geodesy;
 pub mod graph;
 pub mod jobs;
+pub mod locating;
 pub mod print;
 pub mod scene;
 pub mod session;

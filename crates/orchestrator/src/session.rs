@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
 
 use anyhow::Result;
 
@@ -77,19 +77,23 @@ impl Session {
     }
 }
 
-/// A flag that Ctrl-C and SIGTERM set; a second one ends the process at once.
+/// The flag that Ctrl-C and SIGTERM set; a second one ends the process at once.
 pub fn stop_on_signal() -> Arc<AtomicBool> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
-    let handler = move || {
-        if flag.swap(true, Ordering::SeqCst) {
-            std::process::exit(2);
-        }
-        crate::print::note("stopping after the running jobs; press Ctrl-C again to stop at once");
+    static STOP: OnceLock<Arc<AtomicBool>> = OnceLock::new();
+    let install = || {
+        let stop = Arc::new(AtomicBool::new(false));
+        let flag = Arc::clone(&stop);
+        let handler = move || {
+            if flag.swap(true, Ordering::SeqCst) {
+                std::process::exit(2);
+            }
+            crate::print::note("stopping after the running jobs; press Ctrl-C again to stop at once");
+        };
+        // Without a handler the signal ends the process, which loses no finished job either.
+        let _ = ctrlc::set_handler(handler);
+        stop
     };
-    // Without a handler the signal ends the process, which loses no finished job either.
-    let _ = ctrlc::set_handler(handler);
-    stop
+    Arc::clone(STOP.get_or_init(install))
 }
 
 /// The store's folder: `--cache`, else `SETLOC_CACHE`, else `.setloc-cache` beside the output.

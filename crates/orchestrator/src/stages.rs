@@ -139,6 +139,14 @@ mod shim {
         Ok(ImageFeatures { width: image.width, height: image.height, ..ImageFeatures::default() })
     }
 
+    /// Renders the sample town as a data set.
+    ///
+    /// # Errors
+    /// Always, until the town is there.
+    pub fn write_sample(_folder: &std::path::Path) -> anyhow::Result<()> {
+        anyhow::bail!("the sample town is not part of this build")
+    }
+
     /// Matches two images.
     pub fn match_features(
         _params: &MatchParams,

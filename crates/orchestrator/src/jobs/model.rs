@@ -39,6 +39,9 @@ pub struct ModelJobs {
 }
 
 /// Adds all jobs from image files to a model.
+///
+/// # Errors
+/// When parameters have no JSON form.
 pub fn add_model(
     graph: &mut JobGraph<'_>,
     kind: ModelKind,
@@ -48,8 +51,7 @@ pub fn add_model(
     config: &Config,
     seed: u64,
 ) -> Result<ModelJobs> {
-    let features =
-        images.iter().map(|image| add_features(graph, image, config)).collect::<Result<Vec<_>>>()?;
+    let features = add_features_of(graph, images, config);
     let mut pairs = Vec::new();
     for (a, b) in choose_pairs(&config.pairs, positions) {
         pairs.push((a, b, add_pair(graph, images, &features, (a, b), config, seed)?));
@@ -86,6 +88,11 @@ pub fn add_model(
     Ok(ModelJobs { features, model })
 }
 
+/// Adds decoding and extraction of each image.
+pub fn add_features_of(graph: &mut JobGraph<'_>, images: &[SourceImage], config: &Config) -> Vec<JobId> {
+    images.iter().map(|image| add_features(graph, image, config)).collect()
+}
+
 fn features_role(at: usize) -> String {
     format!("features {at:04}")
 }
@@ -99,7 +106,7 @@ fn is_swapped(images: &[SourceImage], a: usize, b: usize) -> bool {
     images[b].hash < images[a].hash
 }
 
-fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, config: &Config) -> Result<JobId> {
+fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, config: &Config) -> JobId {
     let mut external = BTreeMap::from([("image".to_owned(), image.hash)]);
     let mask = image.mask.clone();
     if let Some((_, hash)) = &mask {
@@ -117,7 +124,7 @@ fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, config: &Config) 
         Product::new(stages::extract(&features, &decoded, &camera, mask.as_ref())?)
     };
     let (kind, version, name) = ("features", stages::FEATURES_VERSION, image.name.clone());
-    Ok(graph.add(Job { kind, version, name, params, external, memory, work: Box::new(work) }))
+    graph.add(Job { kind, version, name, params, external, memory, work: Box::new(work) })
 }
 
 fn read_mask(path: &PathBuf, hash: ContentHash) -> Result<stages::Mask> {
