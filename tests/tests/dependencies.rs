@@ -9,7 +9,8 @@ fn edges() -> BTreeMap<String, Vec<String>> {
     let manifest = concat!(env!("CARGO_MANIFEST_DIR"), "/../Cargo.toml");
     let metadata = MetadataCommand::new().manifest_path(manifest).no_deps().exec().unwrap();
     let normal = |package: &cargo_metadata::Package| {
-        let normal = package.dependencies.iter().filter(|dependency| dependency.kind == DependencyKind::Normal);
+        let normal =
+            package.dependencies.iter().filter(|dependency| dependency.kind == DependencyKind::Normal);
         normal.map(|dependency| dependency.name.clone()).collect()
     };
     metadata.packages.iter().map(|package| (package.name.to_string(), normal(package))).collect()
@@ -34,9 +35,11 @@ fn crates_depend_only_on_those_before_them() {
 fn files_terminal_and_graph_belong_to_the_orchestrator() {
     let reserved = ["bincode", "clap", "petgraph", "indicatif", "anyhow", "ctrlc", "toml", "tempfile"];
     for (name, dependencies) in edges().iter().filter(|(name, _)| *name != "setloc-orchestrator") {
-        let found: Vec<_> = dependencies.iter().filter(|dependency| reserved.contains(&dependency.as_str())).collect();
+        let found: Vec<_> =
+            dependencies.iter().filter(|dependency| reserved.contains(&dependency.as_str())).collect();
         assert!(found.is_empty(), "{name} must not depend on {found:?}");
     }
-    let opencv: Vec<_> = edges().into_iter().filter(|(_, d)| d.contains(&"opencv".to_owned())).map(|(n, _)| n).collect();
+    let opencv: Vec<_> =
+        edges().into_iter().filter(|(_, d)| d.contains(&"opencv".to_owned())).map(|(n, _)| n).collect();
     assert_eq!(opencv, ["setloc-features"]);
 }

@@ -25,7 +25,13 @@ fn assert_main_job(figures: &DatasetFigures) {
     assert!(position.median < 0.05 && rotation.median < 0.1, "{position:?} {rotation:?}");
     for set in &figures.sets {
         let (single, refined) = (&set.methods["single"], &set.methods["camset+opt"]);
-        assert!(refined.registered * 10 >= set.images * 9, "{}: {} of {}", set.name, refined.registered, set.images);
+        assert!(
+            refined.registered * 10 >= set.images * 9,
+            "{}: {} of {}",
+            set.name,
+            refined.registered,
+            set.images
+        );
         assert!(single.registered < refined.registered, "{}", set.name);
         let (position, rotation) = (refined.position_m.unwrap(), refined.rotation_deg.unwrap());
         assert!(position.median < 0.3 && rotation.median < 0.5, "{}: {position:?} {rotation:?}", set.name);

@@ -62,7 +62,7 @@ pub fn build_scene(
         if skipped.len() == folder.skipped.len() + folder.images.len() {
             let reasons: Vec<String> = skipped.iter().map(|s| format!("{}: {}", s.name, s.reason)).collect();
             let message = format!("no usable image: {}", reasons.join("; "));
-            return Err(Hinted::new(message, "check the files with an image viewer"));
+            return Err(Hinted::error(message, "check the files with an image viewer"));
         }
         let Some(hash) = executor.output(jobs.scene) else {
             let reasons: Vec<String> =

@@ -128,7 +128,7 @@ pub fn encode<T: Artifact>(value: &T) -> Result<Vec<u8>, CodecError> {
 /// # Errors
 /// Every variant of [`CodecError`] but `Encode`.
 pub fn decode<T: Artifact>(file: &[u8]) -> Result<T, CodecError> {
-    let (kind, schema, checksum, payload) = split(file)?;
+    let Parts { kind, schema, checksum, payload } = split(file)?;
     if kind != T::KIND.as_bytes() {
         return Err(CodecError::Kind { expected: T::KIND, got: String::from_utf8_lossy(kind).into_owned() });
     }
@@ -141,8 +141,15 @@ pub fn decode<T: Artifact>(file: &[u8]) -> Result<T, CodecError> {
     T::from_payload(payload)
 }
 
-/// Kind, schema, checksum and payload of an artifact file.
-fn split(file: &[u8]) -> Result<(&[u8], u32, &[u8], &[u8]), CodecError> {
+/// The parts of an artifact file.
+struct Parts<'f> {
+    kind: &'f [u8],
+    schema: u32,
+    checksum: &'f [u8],
+    payload: &'f [u8],
+}
+
+fn split(file: &[u8]) -> Result<Parts<'_>, CodecError> {
     let mut rest = file;
     let mut take = |count: usize| {
         let (head, tail) =
@@ -162,7 +169,7 @@ fn split(file: &[u8]) -> Result<(&[u8], u32, &[u8], &[u8]), CodecError> {
     if rest.len() as u64 != length {
         return Err(CodecError::Header("its length is not the stated one (truncated?)"));
     }
-    Ok((kind, schema, checksum, rest))
+    Ok(Parts { kind, schema, checksum, payload: rest })
 }
 
 #[cfg(test)]

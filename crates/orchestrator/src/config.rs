@@ -74,7 +74,7 @@ impl Config {
         let text = toml::to_string(&table)?;
         toml::from_str(&text).map_err(|error| {
             let message = format!("invalid setting: {}", error.message());
-            Hinted::new(message, "`setloc build --print-config` lists all keys with their values")
+            Hinted::error(message, "`setloc build --print-config` lists all keys with their values")
         })
     }
 
@@ -89,7 +89,7 @@ impl Config {
 
 /// Puts one `a.b=value` into a table.
 fn apply(table: &mut toml::Table, setting: &str) -> Result<()> {
-    let wrong = || Hinted::new(format!("`{setting}` is no setting"), "write it as --set stage.key=value");
+    let wrong = || Hinted::error(format!("`{setting}` is no setting"), "write it as --set stage.key=value");
     let (key, value) = setting.split_once('=').ok_or_else(wrong)?;
     let value = parse_value(value.trim());
     let mut parts: Vec<&str> = key.trim().split('.').collect();

@@ -16,7 +16,7 @@ impl Hinted {
     }
 
     /// A new error with a hint.
-    pub fn new(
+    pub fn error(
         message: impl fmt::Display + fmt::Debug + Send + Sync + 'static,
         hint: impl Into<String>,
     ) -> anyhow::Error {

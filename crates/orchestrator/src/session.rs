@@ -98,7 +98,6 @@ pub fn stop_on_signal() -> Arc<AtomicBool> {
 
 /// The store's folder: `--cache`, else `SETLOC_CACHE`, else `.setloc-cache` beside the output.
 pub fn cache_folder(given: Option<&Path>, output: &Path) -> PathBuf {
-    given
-        .map(Path::to_owned)
-        .unwrap_or_else(|| output.parent().unwrap_or(Path::new("")).join(".setloc-cache"))
+    let beside = || output.parent().unwrap_or(Path::new("")).join(".setloc-cache");
+    given.map_or_else(beside, Path::to_owned)
 }

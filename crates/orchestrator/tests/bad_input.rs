@@ -22,7 +22,11 @@ fn an_empty_folder_is_an_error_with_a_hint() {
     std::fs::create_dir(folder.path().join("panoramas")).unwrap();
     let output = setloc(folder.path(), &["build", "panoramas", "-o", "s.setloc"]);
     assert_eq!(output.status.code(), Some(2));
-    assert!(said(&output).contains("error: no images") && said(&output).contains("hint:"), "{}", said(&output));
+    assert!(
+        said(&output).contains("error: no images") && said(&output).contains("hint:"),
+        "{}",
+        said(&output)
+    );
 }
 
 #[test]
@@ -40,7 +44,10 @@ fn bad_images_among_good_ones_are_skipped_with_a_reason() {
     let output = setloc(folder.path(), &["build", "panoramas", "-o", "s.setloc"]);
     let text = said(&output);
     assert!(matches!(output.status.code(), Some(0 | 1)), "{text}");
-    assert!(text.contains("skipped panoramas/text.jpg") && text.contains("skipped panoramas/nothing.jpg"), "{text}");
+    assert!(
+        text.contains("skipped panoramas/text.jpg") && text.contains("skipped panoramas/nothing.jpg"),
+        "{text}"
+    );
     assert!(!text.contains("skipped panoramas/a.jpg"), "{text}");
     assert!(folder.path().join("s.setloc").is_file());
 }

@@ -17,7 +17,8 @@ fn write_picture(path: &Path, seed: u32) {
         state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         shades.push((state >> 24) as u8);
     }
-    let picture = image::RgbImage::from_fn(256, 128, |x, y| image::Rgb([shades[((y / 4) * 64 + x / 4) as usize]; 3]));
+    let picture =
+        image::RgbImage::from_fn(256, 128, |x, y| image::Rgb([shades[((y / 4) * 64 + x / 4) as usize]; 3]));
     picture.save(path).unwrap();
 }
 
@@ -98,7 +99,11 @@ fn a_removed_or_added_panorama_keeps_the_others_work() {
     build(&store, &images, &Config::default());
     std::fs::rename(images.join("p1.png"), folder.path().join("aside.png")).unwrap();
     let removed = build(&store, &images, &Config::default());
-    assert!(ran(&removed, "features").is_empty() && ran(&removed, "verify").is_empty(), "{:?}", removed.run.ran);
+    assert!(
+        ran(&removed, "features").is_empty() && ran(&removed, "verify").is_empty(),
+        "{:?}",
+        removed.run.ran
+    );
     std::fs::rename(folder.path().join("aside.png"), images.join("p1.png")).unwrap();
     let back = build(&store, &images, &Config::default());
     assert!(back.run.ran.is_empty(), "{:?}", back.run.ran);
@@ -150,7 +155,8 @@ fn two_builds_at_once_on_one_store_are_both_right() {
     let folder = tempfile::tempdir().unwrap();
     let (images, store) = (panoramas(folder.path(), 4), folder.path().join("store"));
     let hashes = std::thread::scope(|scope| {
-        let runs: Vec<_> = (0..2).map(|_| scope.spawn(|| build(&store, &images, &Config::default()).hash)).collect();
+        let runs: Vec<_> =
+            (0..2).map(|_| scope.spawn(|| build(&store, &images, &Config::default()).hash)).collect();
         runs.into_iter().map(|run| run.join().unwrap()).collect::<Vec<_>>()
     });
     assert_eq!(hashes[0], hashes[1]);

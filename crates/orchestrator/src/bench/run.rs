@@ -121,7 +121,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         optional("cameras.json").map(|path| CameraBook::read(&path)).transpose()?.unwrap_or_default();
     let kind =
         ["panoramas", "images"].into_iter().find(|name| root.join(name).is_dir()).ok_or_else(|| {
-            Hinted::new(
+            Hinted::error(
                 format!("{} is no data set", root.display()),
                 "a data set has a folder `panoramas` or `images`",
             )

@@ -102,7 +102,7 @@ fn error_row(text: &mut String, set: &SetFigures, method: &str, figures: &Method
     for part in parts {
         match figures.position_m.as_ref().zip(figures.rotation_deg.as_ref()) {
             Some((position, rotation)) => {
-                add(text, format_args!(" {:.3}/{:.3} |", part(position), part(rotation)))
+                add(text, format_args!(" {:.3}/{:.3} |", part(position), part(rotation)));
             }
             None => *text += " - |",
         }

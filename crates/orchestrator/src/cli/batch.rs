@@ -104,7 +104,9 @@ pub fn run(args: &BatchArgs) -> Result<Answer> {
             }
         }
     }
-    summary.iter().for_each(|line| print::data(line));
+    for line in &summary {
+        print::data(line);
+    }
     anyhow::ensure!(failures == 0, "{failures} of {} parts failed", summary.len());
     Ok(if negatives == 0 { Answer::Done } else { Answer::Negative })
 }

@@ -93,7 +93,7 @@ pub fn plan(args: &PlanArgs) -> Result<Answer> {
 
 fn read_sources(source: &SourceArgs) -> Result<ImageFolder> {
     if source.panoramas.is_empty() {
-        return Err(Hinted::new(
+        return Err(Hinted::error(
             "no panoramas given",
             "name a folder: setloc build PANORAMAS -o scene.setloc",
         ));

@@ -14,7 +14,7 @@ fn existing(folder: &Path) -> Result<Store> {
         return Store::open(folder);
     }
     let message = format!("{} is no store of results", folder.display());
-    Err(Hinted::new(
+    Err(Hinted::error(
         message,
         "name it with --cache DIR or SETLOC_CACHE; `build` makes `.setloc-cache` beside its output",
     ))
@@ -43,7 +43,9 @@ pub fn run(args: &CacheArgs) -> Result<Answer> {
         }
         CacheCommand::Verify => {
             let damaged = store.verify()?;
-            damaged.iter().for_each(|name| print::data(&format!("damaged, removed: {name}")));
+            for name in &damaged {
+                print::data(&format!("damaged, removed: {name}"));
+            }
             print::data(&format!("{} damaged objects", damaged.len()));
             return Ok(if damaged.is_empty() { Answer::Done } else { Answer::Negative });
         }
@@ -78,7 +80,7 @@ pub fn explain(args: &ExplainArgs) -> Result<Answer> {
     if found {
         return Ok(Answer::Done);
     }
-    Err(Hinted::new(
+    Err(Hinted::error(
         format!("no job of the last runs is named like `{}`", args.job),
         "`setloc plan` lists all jobs",
     ))

@@ -16,7 +16,7 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
     let empty = Reconstruction::default();
     let model = scene.main().unwrap_or(&empty);
     let needs_output =
-        || Hinted::new("this format is not written to standard output", "name a file or folder with -o");
+        || Hinted::error("this format is not written to standard output", "name a file or folder with -o");
     let markers = scene_markers(model);
     let text = match args.format {
         ExportFormat::Colmap => {

@@ -62,7 +62,7 @@ fn find_target(wanted: Option<&str>, files: &[(String, std::path::PathBuf)]) -> 
         None => files.last(),
     };
     found.map(|(name, _)| name.clone()).ok_or_else(|| {
-        Hinted::new(
+        Hinted::error(
             format!("no photo is named {}", wanted.unwrap_or_default()),
             format!("the photos are {}", names()),
         )

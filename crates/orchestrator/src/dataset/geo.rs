@@ -42,7 +42,7 @@ impl GeoBook {
             };
             if !place.is_valid() {
                 let message = format!("{shown}, line {}: `{line}` is no position", at + 1);
-                return Err(Hinted::new(
+                return Err(Hinted::error(
                     message,
                     "each line is name,lat,lon,alt in WGS84 degrees and metres",
                 ));

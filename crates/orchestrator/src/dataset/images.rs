@@ -79,7 +79,7 @@ pub fn list_images(paths: &[PathBuf]) -> Result<Vec<(String, PathBuf)>> {
     if named.is_empty() {
         let shown: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
         let hint = format!("give a folder with images ({}) or image files", ENDINGS.join(", "));
-        return Err(Hinted::new(format!("no images in {}", shown.join(", ")), hint));
+        return Err(Hinted::error(format!("no images in {}", shown.join(", ")), hint));
     }
     for at in 1..named.len() {
         if named[at].0 == named[at - 1].0 {
@@ -136,7 +136,7 @@ impl ImageFolder {
                 folder.skipped.iter().map(|s| format!("{}: {}", s.name, s.reason)).collect();
             let message =
                 format!("none of {} files is a readable image ({})", files.len(), reasons.join("; "));
-            return Err(Hinted::new(message, "check the files with an image viewer"));
+            return Err(Hinted::error(message, "check the files with an image viewer"));
         }
         Ok(folder)
     }
@@ -148,13 +148,12 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
     let info = stages::probe(&bytes).context("not a readable image")?;
     let known =
         cameras.find(name).filter(|camera| (camera.width, camera.height) == (info.width, info.height));
-    let (camera, camera_fixed, camera_source) = match known {
-        Some(camera) => (camera.clone(), true, "cameras.json".to_owned()),
-        None => {
-            let (camera, source) = stages::guess_camera(&info);
-            let fixed = camera.is_panoramic();
-            (camera, fixed, format!("{source:?}"))
-        }
+    let (camera, camera_fixed, camera_source) = if let Some(camera) = known {
+        (camera.clone(), true, "cameras.json".to_owned())
+    } else {
+        let (camera, source) = stages::guess_camera(&info);
+        let fixed = camera.is_panoramic();
+        (camera, fixed, format!("{source:?}"))
     };
     let exif = (*geo == GeoSource::Exif).then_some(info.metadata.gps).flatten();
     let position =

@@ -11,7 +11,7 @@ use crate::geodesy::Wgs84;
 /// When the scene has no WGS84 origin.
 pub fn geojson(poses: &[(String, Rigid)], origin: Option<Wgs84>) -> Result<Value> {
     let missing =
-        || Hinted::new("the scene has no geographic origin", "build it with --gps geo.csv or --gps exif");
+        || Hinted::error("the scene has no geographic origin", "build it with --gps geo.csv or --gps exif");
     let origin = origin.ok_or_else(missing).context("cannot write GeoJSON")?;
     let feature = |(name, pose): &(String, Rigid)| {
         let place = Wgs84::from_enu(&pose.translation, origin);

@@ -2,6 +2,7 @@
 
 use std::any::Any;
 use std::collections::BTreeMap;
+use std::fmt::Write;
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
@@ -108,17 +109,14 @@ impl<'a> JobGraph<'a> {
 
     /// The graph in Graphviz' language.
     pub fn to_dot(&self) -> String {
+        // Writing to a string cannot fail.
         let mut dot = String::from("digraph setloc {\n  rankdir=LR;\n");
         for id in self.graph.node_indices() {
-            dot += &format!("  {} [label={:?}];\n", id.index(), self.graph[id].label());
+            let _ = writeln!(dot, "  {} [label={:?}];", id.index(), self.graph[id].label());
         }
         for edge in self.graph.edge_references() {
-            dot += &format!(
-                "  {} -> {} [label={:?}];\n",
-                edge.source().index(),
-                edge.target().index(),
-                edge.weight().role
-            );
+            let (from, to) = (edge.source().index(), edge.target().index());
+            let _ = writeln!(dot, "  {from} -> {to} [label={:?}];", edge.weight().role);
         }
         dot + "}\n"
     }

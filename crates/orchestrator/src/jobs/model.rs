@@ -1,7 +1,7 @@
 //! Features, matches, verification and mapping of a list of images: for scenes and for local models.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
@@ -127,7 +127,7 @@ fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, config: &Config) 
     graph.add(Job { kind, version, name, params, external, memory, work: Box::new(work) })
 }
 
-fn read_mask(path: &PathBuf, hash: ContentHash) -> Result<stages::Mask> {
+fn read_mask(path: &Path, hash: ContentHash) -> Result<stages::Mask> {
     let bytes = read_unchanged(path, hash)?;
     stages::read_mask(&bytes).with_context(|| format!("mask {}", path.display()))
 }
