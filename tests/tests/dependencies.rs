@@ -1,5 +1,7 @@
 //! Dependencies run one way, and what only the orchestrator may use is used there only.
 
+#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
+
 use std::collections::BTreeMap;
 
 use cargo_metadata::{DependencyKind, MetadataCommand};

@@ -1,5 +1,7 @@
 //! The whole path on data with truth.
 
+#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
+
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;

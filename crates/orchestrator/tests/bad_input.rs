@@ -1,5 +1,7 @@
 //! The program on bad input: exit codes and what it says.
 
+#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
+
 use std::path::Path;
 use std::process::{Command, Output};
 

@@ -1,5 +1,7 @@
 //! What runs again after which change, asserted by job lists.
 
+#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
