@@ -53,8 +53,7 @@ impl Store {
     /// When the folders cannot be made.
     pub fn open(root: &Path) -> Result<Self> {
         for folder in ["objects", "keys", "runs"] {
-            let path = root.join(folder);
-            fs::create_dir_all(&path).map_err(|e| write_error(e, &path))?;
+            create_folder(&root.join(folder))?;
         }
         Ok(Self { root: root.to_owned() })
     }
@@ -297,13 +296,21 @@ fn files_below(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(files)
 }
 
+/// Makes a folder and those above it.
+///
+/// # Errors
+/// When it cannot be made, with what to do about it.
+pub fn create_folder(path: &Path) -> Result<()> {
+    fs::create_dir_all(path).map_err(|e| write_error(e, path))
+}
+
 /// Writes a file so that readers see the old one, or the new one whole, whatever happens.
 ///
 /// # Errors
 /// When the disk is full or not writable; nothing is left behind then.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    fs::create_dir_all(folder).map_err(|e| write_error(e, folder))?;
+    create_folder(folder)?;
     let write = || -> std::io::Result<()> {
         let mut file = tempfile::Builder::new().prefix(".writing-").tempfile_in(folder)?;
         file.write_all(bytes)?;

@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use serde::Serialize;
 use setloc_features::ImageFeatures;
-use setloc_sfm::{Reconstruction, Rigid, Similarity};
+use setloc_sfm::{Observation, Reconstruction, ReconstructionPoint, Rigid, Similarity};
 
 /// One image's error against truth.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -136,19 +136,21 @@ pub fn mean_angular_error_px(
     model: &Reconstruction,
     features: &BTreeMap<String, std::sync::Arc<ImageFeatures>>,
 ) -> Option<f64> {
-    let (mut sum, mut count) = (0.0, 0_usize);
     let of_image: Vec<_> = model.images.iter().map(|image| features.get(&image.name)).collect();
-    for point in &model.points {
-        for observation in &point.track {
-            let pose = model.images[observation.image.index()].world_from_camera?;
-            let keypoint =
-                of_image[observation.image.index()]?.keypoints.get(observation.feature as usize)?;
-            let camera = model.camera_of(observation.image);
-            let (bearing, unit) =
-                (camera.unproject(&keypoint.pixel())?, camera.pixel_angle(&keypoint.pixel())?);
-            sum += pose.inverse_transform_point(&point.position).angle(&bearing) / unit;
-            count += 1;
-        }
+    let error = |observation: &Observation, position: &Vector3<f64>| {
+        let pose = model.images[observation.image.index()].world_from_camera?;
+        let keypoint = of_image[observation.image.index()]?.keypoints.get(observation.feature as usize)?;
+        let camera = model.camera_of(observation.image);
+        let (bearing, unit) = (camera.unproject(&keypoint.pixel())?, camera.pixel_angle(&keypoint.pixel())?);
+        Some(pose.inverse_transform_point(position).angle(&bearing) / unit)
+    };
+    let of_point = |point: &ReconstructionPoint| -> Vec<f64> {
+        point.track.iter().filter_map(|observation| error(observation, &point.position)).collect()
+    };
+    let (mut sum, mut count) = (0.0, 0_usize);
+    for value in model.points.iter().flat_map(of_point) {
+        sum += value;
+        count += 1;
     }
     (count > 0).then(|| sum / count as f64)
 }

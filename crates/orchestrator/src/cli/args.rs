@@ -96,7 +96,7 @@ impl RunArgs {
             memory: self.memory.unwrap_or_else(|| crate::clock::physical_memory() / 4 * 3),
         };
         if let Some(folder) = log_folder {
-            std::fs::create_dir_all(folder)?;
+            crate::store::create_folder(folder)?;
         }
         let log = log_folder.map(|folder| folder.join("run.jsonl"));
         Session::open(&cache_folder(self.cache.as_deref(), output), log.as_deref(), limits, Arc::clone(stop))
