@@ -1,2 +1,7 @@
 //! The `setloc` program.
-fn main() {}
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    setloc_orchestrator::cli::main()
+}

@@ -1,0 +1,93 @@
+//! What the jobs hand on, as files.
+
+use serde::{Deserialize, Serialize};
+use setloc_camset::{PhotoLocalization, SetLocalization};
+use setloc_features::{ImageFeatures, Keypoint, Match};
+use setloc_index::SceneIndex;
+use setloc_sfm::{MapperOutput, TwoView};
+
+use crate::codec::{Artifact, CodecError};
+use crate::serde_artifact;
+
+/// Features as raw blocks behind a short head: a gigabyte of descriptors is copied, not parsed.
+impl Artifact for ImageFeatures {
+    const KIND: &'static str = "features";
+    const SCHEMA: u32 = 1;
+
+    fn to_payload(&self) -> Result<Vec<u8>, CodecError> {
+        let count = self.len();
+        let mut payload = Vec::with_capacity(16 + count * (size_of::<Keypoint>() + 131));
+        payload.extend_from_slice(&self.width.to_le_bytes());
+        payload.extend_from_slice(&self.height.to_le_bytes());
+        payload.extend_from_slice(&(count as u64).to_le_bytes());
+        for keypoint in &self.keypoints {
+            for value in [keypoint.x, keypoint.y, keypoint.size, keypoint.orientation, keypoint.noise_px] {
+                payload.extend_from_slice(&value.to_le_bytes());
+            }
+        }
+        payload.extend_from_slice(bytemuck::cast_slice(&self.colors));
+        payload.extend_from_slice(&self.descriptors);
+        Ok(payload)
+    }
+
+    fn from_payload(payload: &[u8]) -> Result<Self, CodecError> {
+        let wrong = || CodecError::Payload("feature blocks of a wrong length".to_owned());
+        let (head, rest) = payload.split_at_checked(16).ok_or_else(wrong)?;
+        let number = |bytes: &[u8]| bytes.iter().rev().fold(0_u64, |sum, &byte| (sum << 8) | u64::from(byte));
+        let (width, height, count) =
+            (number(&head[..4]) as u32, number(&head[4..8]) as u32, number(&head[8..]) as usize);
+        let (keypoints, rest) =
+            count.checked_mul(20).and_then(|n| rest.split_at_checked(n)).ok_or_else(wrong)?;
+        let (colors, descriptors) =
+            count.checked_mul(3).and_then(|n| rest.split_at_checked(n)).ok_or_else(wrong)?;
+        if count.checked_mul(setloc_features::DESCRIPTOR_LEN) != Some(descriptors.len()) {
+            return Err(wrong());
+        }
+        let keypoint = |block: &[u8]| {
+            let value = |i: usize| f32::from_bits(number(&block[4 * i..4 * i + 4]) as u32);
+            Keypoint { x: value(0), y: value(1), size: value(2), orientation: value(3), noise_px: value(4) }
+        };
+        Ok(Self {
+            width,
+            height,
+            keypoints: keypoints.chunks_exact(20).map(keypoint).collect(),
+            descriptors: descriptors.to_vec(),
+            colors: colors.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),
+        })
+    }
+}
+
+/// Putative matches of two images.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PairMatches(pub Vec<Match>);
+
+impl Artifact for PairMatches {
+    const KIND: &'static str = "matches";
+    const SCHEMA: u32 = 1;
+
+    fn to_payload(&self) -> Result<Vec<u8>, CodecError> {
+        Ok(self.0.iter().flat_map(|m| [m.first.to_le_bytes(), m.second.to_le_bytes()]).flatten().collect())
+    }
+
+    fn from_payload(payload: &[u8]) -> Result<Self, CodecError> {
+        let (chunks, rest) = payload.as_chunks::<8>();
+        if !rest.is_empty() {
+            return Err(CodecError::Payload("matches of a wrong length".to_owned()));
+        }
+        let read = |c: &[u8; 8]| Match {
+            first: u32::from_le_bytes([c[0], c[1], c[2], c[3]]),
+            second: u32::from_le_bytes([c[4], c[5], c[6], c[7]]),
+        };
+        Ok(Self(chunks.iter().map(read).collect()))
+    }
+}
+
+/// The geometry of two images, or that there is none.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct VerifiedPair(pub Option<TwoView>);
+
+serde_artifact!(VerifiedPair, "verified pair", 1);
+serde_artifact!(MapperOutput, "model", 1);
+serde_artifact!(SceneIndex, "index", 1);
+serde_artifact!(PhotoLocalization, "photo localization", 1);
+serde_artifact!(SetLocalization, "set localization", 1);

@@ -1,0 +1,182 @@
+use std::collections::BTreeMap;
+
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+use serde::Serialize;
+use setloc_features::ImageFeatures;
+use setloc_sfm::{Observation, Reconstruction, ReconstructionPoint, Rigid, Similarity};
+
+/// One image's error against truth.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct PoseError {
+    /// Distance of the centres in metres, after alignment.
+    pub position_m: f64,
+    /// Angle between the orientations in degrees, after alignment.
+    pub rotation_deg: f64,
+}
+
+/// Errors by image name.
+pub type Errors = BTreeMap<String, PoseError>;
+
+/// Spread of a scene's errors.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Spread {
+    /// Half of them are below.
+    pub median: f64,
+    /// Arithmetic mean.
+    pub mean: f64,
+    /// The largest.
+    pub max: f64,
+}
+
+/// Spread of a set's errors, as the paper's table has it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Bounds {
+    /// The smallest.
+    pub min: f64,
+    /// Half of them are below.
+    pub median: f64,
+    /// The largest.
+    pub max: f64,
+    /// Arithmetic mean.
+    pub mean: f64,
+}
+
+impl Bounds {
+    /// Of some values, `None` of none.
+    pub fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
+        let mut values: Vec<f64> = values.into_iter().collect();
+        values.sort_by(f64::total_cmp);
+        let (min, max) = (*values.first()?, *values.last()?);
+        let n = values.len();
+        let median = f64::midpoint(values[(n - 1) / 2], values[n / 2]);
+        Some(Self { min, median, max, mean: values.iter().sum::<f64>() / n as f64 })
+    }
+}
+
+impl From<Bounds> for Spread {
+    fn from(bounds: Bounds) -> Self {
+        Self { median: bounds.median, mean: bounds.mean, max: bounds.max }
+    }
+}
+
+/// How the scene's frame lies in the truth's.
+#[derive(Debug, Clone)]
+pub struct Alignment {
+    truth_from_scene: Similarity,
+}
+
+impl Alignment {
+    /// Least squares over the centres of the images that both know; `None` with fewer than 3 or all in one line.
+    pub fn of_centres(estimated: &BTreeMap<String, Rigid>, truth: &BTreeMap<String, Rigid>) -> Option<Self> {
+        let common = estimated
+            .iter()
+            .filter_map(|(name, pose)| Some((pose.translation, truth.get(name)?.translation)));
+        let (source, target): (Vec<_>, Vec<_>) = common.unzip();
+        Similarity::from_point_pairs(&source, &target).map(|truth_from_scene| Self { truth_from_scene })
+    }
+
+    /// The error of a pose.
+    pub fn error(&self, estimated: &Rigid, truth: &Rigid) -> PoseError {
+        let aligned = self.truth_from_scene.transform_pose(estimated);
+        PoseError {
+            position_m: (aligned.translation - truth.translation).norm(),
+            rotation_deg: aligned.rotation.angle_to(&truth.rotation).to_degrees(),
+        }
+    }
+}
+
+/// Rotation errors in degrees when the world's rotation is taken from the rotations themselves (chordal mean).
+///
+/// Free of the error that a poorly spread set of centres gives the alignment.
+pub fn own_rotation_errors_deg(
+    estimated: &BTreeMap<String, Rigid>,
+    truth: &BTreeMap<String, Rigid>,
+) -> Vec<f64> {
+    let pairs: Vec<_> = estimated
+        .iter()
+        .filter_map(|(name, pose)| Some((pose.rotation, truth.get(name)?.rotation)))
+        .collect();
+    let sum: Matrix3<f64> =
+        pairs.iter().map(|(own, true_)| (true_ * own.inverse()).to_rotation_matrix().into_inner()).sum();
+    let svd = sum.svd(true, true);
+    let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else { return Vec::new() };
+    let sign = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
+    let truth_from_scene =
+        UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(u * sign * v_t));
+    pairs.iter().map(|(own, true_)| (truth_from_scene * own).angle_to(true_).to_degrees()).collect()
+}
+
+/// Figures of a scene, in the schema of `results.json`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SceneFigures {
+    /// Image files given.
+    pub images: usize,
+    /// Images in the largest component.
+    pub registered: usize,
+    /// Number of components.
+    pub components: usize,
+    /// Points of the largest component.
+    pub points: usize,
+    /// Observations of the largest component.
+    pub observations: usize,
+    /// Mean angle between observed and predicted ray, in pixels of the image there.
+    pub mean_angular_error_px: Option<f64>,
+    /// Centre errors after alignment.
+    pub position_m: Option<Spread>,
+    /// Rotation errors after alignment by centres.
+    pub rotation_deg: Option<Spread>,
+    /// Rotation errors after alignment by rotations.
+    pub rotation_own_deg: Option<Spread>,
+    /// AUC of relative poses in percent, by threshold in degrees.
+    pub auc: Option<BTreeMap<String, f64>>,
+}
+
+/// Mean angular residual of a model in pixels.
+pub fn mean_angular_error_px(
+    model: &Reconstruction,
+    features: &BTreeMap<String, std::sync::Arc<ImageFeatures>>,
+) -> Option<f64> {
+    let of_image: Vec<_> = model.images.iter().map(|image| features.get(&image.name)).collect();
+    let error = |observation: &Observation, position: &Vector3<f64>| {
+        let pose = model.images[observation.image.index()].world_from_camera?;
+        let keypoint = of_image[observation.image.index()]?.keypoints.get(observation.feature as usize)?;
+        let camera = model.camera_of(observation.image);
+        let (bearing, unit) = (camera.unproject(&keypoint.pixel())?, camera.pixel_angle(&keypoint.pixel())?);
+        Some(pose.inverse_transform_point(position).angle(&bearing) / unit)
+    };
+    let of_point = |point: &ReconstructionPoint| -> Vec<f64> {
+        point.track.iter().filter_map(|observation| error(observation, &point.position)).collect()
+    };
+    let (mut sum, mut count) = (0.0, 0_usize);
+    for value in model.points.iter().flat_map(of_point) {
+        sum += value;
+        count += 1;
+    }
+    (count > 0).then(|| sum / count as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bounds_are_those_of_the_values() {
+        let bounds = Bounds::of([3.0, 1.0, 2.0, 10.0]).unwrap();
+        assert_eq!((bounds.min, bounds.median, bounds.max, bounds.mean), (1.0, 2.5, 10.0, 4.0));
+        assert!(Bounds::of([]).is_none());
+    }
+
+    #[test]
+    fn own_rotation_alignment_removes_a_turned_world() {
+        let turn = UnitQuaternion::from_euler_angles(0.4, -0.2, 1.0);
+        let pose = |i: u32| {
+            Rigid::new(UnitQuaternion::from_euler_angles(0.0, 0.3 * f64::from(i), 0.1), Vector3::zeros())
+        };
+        let truth: BTreeMap<_, _> = (0..5).map(|i| (i.to_string(), pose(i))).collect();
+        let moved = truth
+            .iter()
+            .map(|(name, p)| (name.clone(), Rigid::new(turn * p.rotation, p.translation)))
+            .collect();
+        assert!(own_rotation_errors_deg(&moved, &truth).iter().all(|error| *error < 1e-6));
+    }
+}

@@ -1,0 +1,285 @@
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use serde::Serialize;
+use setloc_camset::{PhotoLocalization, Verdict};
+use setloc_sfm::{Reconstruction, Rigid};
+
+use super::figures::{mean_angular_error_px, own_rotation_errors_deg};
+use super::{AUC_THRESHOLDS_DEG, Alignment, Bounds, Errors, PoseError, SceneFigures, auc_percent};
+use crate::building::{BuildOutcome, Built, build_scene};
+use crate::config::Config;
+use crate::dataset::{CameraBook, GeoSource, ImageFolder, SkippedImage, Truth, list_images};
+use crate::error::Hinted;
+use crate::jobs::LocateJobs;
+use crate::locating::{Located, Mode, locate};
+use crate::session::Session;
+use crate::subscribers::StageReport;
+
+/// How to bench.
+#[derive(Debug, Clone)]
+pub struct BenchOptions {
+    /// Parameters.
+    pub config: Config,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Whether the scene uses `geo.csv` or EXIF positions.
+    pub gps: BenchGps,
+}
+
+/// Positions given to the scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+pub enum BenchGps {
+    /// None.
+    #[default]
+    None,
+    /// The data set's `geo.csv`.
+    Geo,
+    /// The images' EXIF.
+    Exif,
+}
+
+/// Figures of one method on one set.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct MethodFigures {
+    /// Photos that have a pose and the verdict "localized".
+    pub registered: usize,
+    /// Centre errors of the registered photos.
+    pub position_m: Option<Bounds>,
+    /// Rotation errors of the registered photos.
+    pub rotation_deg: Option<Bounds>,
+    /// Error of the target, when registered and known.
+    pub target: Option<PoseError>,
+    /// Whether the target is registered.
+    pub target_registered: bool,
+    /// Registered photos' errors by name.
+    #[serde(skip)]
+    pub errors: Errors,
+    /// All photos' answers.
+    #[serde(skip)]
+    pub answers: Vec<PhotoLocalization>,
+}
+
+/// Figures of one set.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SetFigures {
+    /// The set's folder.
+    pub name: String,
+    /// Number of photo files.
+    pub images: usize,
+    /// The target's name.
+    pub target: String,
+    /// By method: `single`, `camset`, `camset+opt`.
+    pub methods: BTreeMap<String, MethodFigures>,
+    /// Registered photos of each local component.
+    pub local_models: Vec<usize>,
+    /// What to do better.
+    pub advice: Vec<String>,
+}
+
+/// Figures of a data set, in the schema of `results.json`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct DatasetFigures {
+    /// The folder's name.
+    pub dataset: String,
+    /// The scene.
+    pub scene: SceneFigures,
+    /// The sets.
+    pub sets: Vec<SetFigures>,
+    /// Time by stage.
+    pub stages: Vec<StageReport>,
+    /// Most memory held, in MiB.
+    pub peak_rss_mb: f64,
+    /// Wall seconds of the whole bench.
+    pub wall_s: f64,
+    /// CPU seconds of the whole bench.
+    pub cpu_s: f64,
+    /// Which positions the scene was given.
+    pub gps: String,
+    /// Unusable images.
+    pub skipped: Vec<SkippedImage>,
+    /// What the mapper found worth saying.
+    pub warnings: Vec<String>,
+    /// The scene's largest component.
+    #[serde(skip)]
+    pub model: Reconstruction,
+    /// The scene's errors by image.
+    #[serde(skip)]
+    pub scene_errors: Errors,
+}
+
+/// Builds the scene of a data set, locates its sets and compares with its truth.
+///
+/// # Errors
+/// When the folder is no data set, the run was stopped or the store cannot be written.
+pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> Result<DatasetFigures> {
+    let optional = |name: &str| Some(root.join(name)).filter(|path| path.is_file());
+    let truth = optional("truth.json").map(|path| Truth::read(&path)).transpose()?;
+    let cameras =
+        optional("cameras.json").map(|path| CameraBook::read(&path)).transpose()?.unwrap_or_default();
+    let kind =
+        ["panoramas", "images"].into_iter().find(|name| root.join(name).is_dir()).ok_or_else(|| {
+            Hinted::error(
+                format!("{} is no data set", root.display()),
+                "a data set has a folder `panoramas` or `images`",
+            )
+        })?;
+    let geo = match options.gps {
+        BenchGps::None => GeoSource::None,
+        BenchGps::Exif => GeoSource::Exif,
+        BenchGps::Geo => GeoSource::Table(root.join("geo.csv")),
+    };
+    let files = list_below(root, &root.join(kind))?;
+    let folder = ImageFolder::read(&files, &cameras, &geo, None)?;
+    let built = match build_scene(session, &folder, &options.config, options.seed, "bench scene", None)? {
+        BuildOutcome::Built(built) => *built,
+        BuildOutcome::Unchanged(..) => anyhow::bail!("the scene was not read: this is a bug"),
+    };
+    let model = built.scene.main().cloned().unwrap_or_default();
+    let estimated = poses_of(&model);
+    let true_scene = truth_of(truth.as_ref(), &format!("{kind}/"));
+    let alignment = Alignment::of_centres(&estimated, &true_scene);
+    let scene_errors = alignment.as_ref().map_or_else(Errors::new, |a| errors_of(a, &estimated, &true_scene));
+    let scene = scene_figures(files.len(), &built, &model, &estimated, &true_scene, &scene_errors);
+    let mut sets = Vec::new();
+    let mut skipped = built.skipped.clone();
+    for set in set_folders(root)? {
+        let name = set.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        let files = list_below(root, &set)?;
+        let photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
+        let target = files.last().map(|(name, _)| name.clone()).unwrap_or_default();
+        let what = LocateJobs {
+            scene: Arc::clone(&built.scene),
+            scene_hash: built.hash,
+            config: options.config.clone(),
+            seed: options.seed,
+        };
+        let located = locate(session, &photos, &what, Mode::Both, &format!("bench {name}"), &target)?;
+        skipped.extend(located.skipped.clone());
+        let true_photos = truth_of(truth.as_ref(), &format!("queries/{name}/"));
+        sets.push(set_figures(name, files.len(), target, located, alignment.as_ref(), &true_photos));
+    }
+    let (wall_s, cpu_s) = session.report.totals();
+    Ok(DatasetFigures {
+        dataset: root.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
+        scene,
+        sets,
+        stages: session.report.stages(),
+        peak_rss_mb: crate::clock::peak_rss_mib(),
+        wall_s,
+        cpu_s,
+        gps: format!("{:?}", options.gps).to_lowercase(),
+        skipped,
+        warnings: built.scene.warnings.clone(),
+        model,
+        scene_errors,
+    })
+}
+
+/// Images of a folder, named by their path below `root`.
+fn list_below(root: &Path, folder: &Path) -> Result<Vec<(String, PathBuf)>> {
+    let mut files = list_images(&[folder.to_owned()])?;
+    for (name, path) in &mut files {
+        let below = path
+            .strip_prefix(root)
+            .with_context(|| format!("{} is not below {}", path.display(), root.display()))?;
+        *name = below.to_string_lossy().replace('\\', "/");
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// The folders of the query sets, sorted.
+fn set_folders(root: &Path) -> Result<Vec<PathBuf>> {
+    let queries = root.join("queries");
+    if !queries.is_dir() {
+        return Ok(Vec::new());
+    }
+    let entries =
+        std::fs::read_dir(&queries).with_context(|| format!("cannot list {}", queries.display()))?;
+    let mut folders = entries.map(|entry| Ok(entry?.path())).collect::<Result<Vec<_>>>()?;
+    folders.retain(|path| path.is_dir());
+    folders.sort();
+    Ok(folders)
+}
+
+fn truth_of(truth: Option<&Truth>, prefix: &str) -> BTreeMap<String, Rigid> {
+    let Some(truth) = truth else { return BTreeMap::new() };
+    truth.names(prefix).filter_map(|name| Some((name.to_owned(), truth.pose(name)?))).collect()
+}
+
+fn poses_of(model: &Reconstruction) -> BTreeMap<String, Rigid> {
+    model.images.iter().filter_map(|image| Some((image.name.clone(), image.world_from_camera?))).collect()
+}
+
+fn errors_of(
+    alignment: &Alignment,
+    estimated: &BTreeMap<String, Rigid>,
+    truth: &BTreeMap<String, Rigid>,
+) -> Errors {
+    let one = |(name, pose): (&String, &Rigid)| Some((name.clone(), alignment.error(pose, truth.get(name)?)));
+    estimated.iter().filter_map(one).collect()
+}
+
+fn scene_figures(
+    images: usize,
+    built: &Built,
+    model: &Reconstruction,
+    estimated: &BTreeMap<String, Rigid>,
+    truth: &BTreeMap<String, Rigid>,
+    errors: &Errors,
+) -> SceneFigures {
+    let spread = |value: fn(&PoseError) -> f64| Bounds::of(errors.values().map(value)).map(Into::into);
+    let auc = || AUC_THRESHOLDS_DEG.iter().map(f64::to_string).zip(auc_percent(estimated, truth)).collect();
+    SceneFigures {
+        images,
+        registered: estimated.len(),
+        components: built.scene.components.len(),
+        points: model.points.len(),
+        observations: model.observation_count(),
+        mean_angular_error_px: mean_angular_error_px(model, &built.features),
+        position_m: spread(|error| error.position_m),
+        rotation_deg: spread(|error| error.rotation_deg),
+        rotation_own_deg: Bounds::of(own_rotation_errors_deg(estimated, truth)).map(Into::into),
+        auc: (!truth.is_empty()).then(auc),
+    }
+}
+
+fn set_figures(
+    name: String,
+    images: usize,
+    target: String,
+    located: Located,
+    alignment: Option<&Alignment>,
+    truth: &BTreeMap<String, Rigid>,
+) -> SetFigures {
+    let set = located.set.unwrap_or_default();
+    let methods = [("single", located.single), ("camset", set.rigid), ("camset+opt", set.refined)];
+    let methods = methods
+        .map(|(method, answers)| (method.to_owned(), method_figures(answers, &target, alignment, truth)));
+    let methods = BTreeMap::from(methods);
+    SetFigures { name, images, target, methods, local_models: located.local_models, advice: set.advice }
+}
+
+fn method_figures(
+    answers: Vec<PhotoLocalization>,
+    target: &str,
+    alignment: Option<&Alignment>,
+    truth: &BTreeMap<String, Rigid>,
+) -> MethodFigures {
+    let localized = answers.iter().filter(|photo| photo.verdict == Verdict::Localized);
+    let registered: BTreeMap<String, Rigid> =
+        localized.filter_map(|photo| Some((photo.name.clone(), photo.world_from_camera?))).collect();
+    let errors = alignment.map_or_else(Errors::new, |alignment| errors_of(alignment, &registered, truth));
+    MethodFigures {
+        registered: registered.len(),
+        position_m: Bounds::of(errors.values().map(|error| error.position_m)),
+        rotation_deg: Bounds::of(errors.values().map(|error| error.rotation_deg)),
+        target: errors.get(target).copied(),
+        target_registered: registered.contains_key(target),
+        errors,
+        answers,
+    }
+}

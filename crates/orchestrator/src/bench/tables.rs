@@ -1,0 +1,137 @@
+use std::fmt::Write;
+
+use super::{Bounds, DatasetFigures, MethodFigures, SetFigures};
+
+/// Methods in the paper's order.
+const METHODS: [&str; 3] = ["single", "camset", "camset+opt"];
+
+/// The scene's figures and the paper's two tables in Markdown.
+pub fn markdown_tables(figures: &DatasetFigures) -> String {
+    let mut text = format!("# {}\n\n## Scene\n\n", figures.dataset);
+    scene_table(&mut text, figures);
+    if !figures.sets.is_empty() {
+        text +=
+            "\n## Registration rate\n\nRegistered: has a pose and the verdict \"localized\".\n\n| method |";
+        for set in &figures.sets {
+            add(&mut text, format_args!(" {} #reg./#total | rate |", set.name));
+        }
+        text += "\n|---|";
+        text += &"---|---|".repeat(figures.sets.len());
+        for method in METHODS {
+            add(&mut text, format_args!("\n| {method} |"));
+            for set in &figures.sets {
+                let registered = set.methods.get(method).map_or(0, |figures| figures.registered);
+                let rate = 100.0 * registered as f64 / set.images.max(1) as f64;
+                add(&mut text, format_args!(" {registered}/{} | {rate:.2} % |", set.images));
+            }
+        }
+        text += "\n\n## Location error (m / deg)\n\nOver the registered photos, after aligning the scene to the truth by its images' centres.\n\n";
+        text += "| set | method | #reg./#total | min | median | max | mean | target |\n|---|---|---|---|---|---|---|---|\n";
+        for set in &figures.sets {
+            for method in METHODS {
+                if let Some(figures) = set.methods.get(method) {
+                    error_row(&mut text, set, method, figures);
+                }
+            }
+        }
+    }
+    text += "\n## Time\n\n| stage | jobs run | from cache | wall s | CPU s |\n|---|---|---|---|---|\n";
+    for stage in &figures.stages {
+        let (ran, cached) = (stage.ran, stage.cached);
+        add(
+            &mut text,
+            format_args!(
+                "| {} | {ran} | {cached} | {:.2} | {:.2} |\n",
+                stage.name, stage.wall_s, stage.cpu_s
+            ),
+        );
+    }
+    add(&mut text, format_args!("| all | | | {:.2} | {:.2} |\n\n", figures.wall_s, figures.cpu_s));
+    add(&mut text, format_args!("Peak memory {:.0} MiB.\n", figures.peak_rss_mb));
+    text
+}
+
+/// Writing to a string cannot fail.
+fn add(text: &mut String, line: std::fmt::Arguments<'_>) {
+    let _ = text.write_fmt(line);
+}
+
+fn scene_table(text: &mut String, figures: &DatasetFigures) {
+    let scene = &figures.scene;
+    add(
+        text,
+        format_args!(
+            "GPS: {}. Registered {}/{} images in the largest of {} components",
+            figures.gps, scene.registered, scene.images, scene.components
+        ),
+    );
+    add(text, format_args!(", {} points, {} observations", scene.points, scene.observations));
+    if let Some(error) = scene.mean_angular_error_px {
+        add(text, format_args!(", mean angular error {error:.3} px"));
+    }
+    *text += ".\n";
+    let rows = [
+        ("position m", scene.position_m),
+        ("rotation °", scene.rotation_deg),
+        ("rotation ° (own alignment)", scene.rotation_own_deg),
+    ];
+    if scene.position_m.is_some() {
+        *text += "\n| error | median | mean | max |\n|---|---|---|---|\n";
+        for (name, spread) in rows {
+            if let Some(s) = spread {
+                add(text, format_args!("| {name} | {:.4} | {:.4} | {:.4} |\n", s.median, s.mean, s.max));
+            }
+        }
+    }
+    if let Some(auc) = &scene.auc {
+        let parts: Vec<String> =
+            auc.iter().map(|(threshold, area)| format!("{threshold}° {area:.2}")).collect();
+        add(text, format_args!("\nAUC of relative poses: {}\n", parts.join(", ")));
+    }
+    for skipped in &figures.skipped {
+        add(text, format_args!("\nSkipped {}: {}\n", skipped.name, skipped.reason));
+    }
+    for warning in &figures.warnings {
+        add(text, format_args!("\nWarning: {warning}\n"));
+    }
+}
+
+fn error_row(text: &mut String, set: &SetFigures, method: &str, figures: &MethodFigures) {
+    add(text, format_args!("| {} | {method} | {}/{} |", set.name, figures.registered, set.images));
+    let parts: [fn(&Bounds) -> f64; 4] = [|b| b.min, |b| b.median, |b| b.max, |b| b.mean];
+    for part in parts {
+        match figures.position_m.as_ref().zip(figures.rotation_deg.as_ref()) {
+            Some((position, rotation)) => {
+                add(text, format_args!(" {:.3}/{:.3} |", part(position), part(rotation)));
+            }
+            None => *text += " - |",
+        }
+    }
+    match figures.target {
+        Some(error) => add(text, format_args!(" {:.3}/{:.3} |\n", error.position_m, error.rotation_deg)),
+        None if figures.target_registered => *text += " registered |\n",
+        None => *text += " - |\n",
+    }
+}
+
+/// One line an image and method: `set,method,name,position_m,rotation_deg,verdict,inliers`.
+pub fn errors_csv(figures: &DatasetFigures) -> String {
+    let mut text = String::from("set,method,name,position_m,rotation_deg,verdict,inliers\n");
+    for (name, error) in &figures.scene_errors {
+        add(&mut text, format_args!(",scene,{name},{},{},,\n", error.position_m, error.rotation_deg));
+    }
+    for set in &figures.sets {
+        for (method, of_method) in &set.methods {
+            for photo in &of_method.answers {
+                let error = of_method.errors.get(&photo.name);
+                let error = error.map_or(",".to_owned(), |e| format!("{},{}", e.position_m, e.rotation_deg));
+                let (verdict, inliers) = (photo.verdict, photo.inliers);
+                add(
+                    &mut text,
+                    format_args!("{},{method},{},{error},{verdict:?},{inliers}\n", set.name, photo.name),
+                );
+            }
+        }
+    }
+    text
+}

@@ -1,0 +1,84 @@
+//! Builds a scene: from a list of images to the scene file.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use anyhow::Result;
+use setloc_features::ImageFeatures;
+
+use crate::config::Config;
+use crate::dataset::{ImageFolder, SkippedImage};
+use crate::error::Hinted;
+use crate::fingerprint::ContentHash;
+use crate::graph::{JobGraph, RunResult};
+use crate::jobs::add_scene;
+use crate::scene::SceneFile;
+use crate::session::Session;
+
+/// A scene that was built, or found built.
+pub struct Built {
+    /// The scene.
+    pub scene: Arc<SceneFile>,
+    /// Its content hash.
+    pub hash: ContentHash,
+    /// Images that are not in it, and why.
+    pub skipped: Vec<SkippedImage>,
+    /// Features by image name.
+    pub features: BTreeMap<String, Arc<ImageFeatures>>,
+    /// What ran.
+    pub run: RunResult,
+}
+
+/// What a build came to.
+pub enum BuildOutcome {
+    /// The result is the one with the expected hash: nothing was read.
+    Unchanged(RunResult, Vec<SkippedImage>),
+    /// The scene.
+    Built(Box<Built>),
+}
+
+/// Builds a scene; with the hash that the output already has, an unchanged scene is not read.
+///
+/// # Errors
+/// When no image is usable, the run was stopped or the store cannot be written.
+pub fn build_scene(
+    session: &Session,
+    folder: &ImageFolder,
+    config: &Config,
+    seed: u64,
+    name: &str,
+    present: Option<ContentHash>,
+) -> Result<BuildOutcome> {
+    let mut graph = JobGraph::default();
+    let jobs = add_scene(&mut graph, &folder.images, config, seed)?;
+    session.run(&graph, |executor, run| {
+        session.remember(name, run.keys.clone())?;
+        let mut skipped = folder.skipped.clone();
+        for (image, job) in folder.images.iter().zip(&jobs.model.features) {
+            if let Some(reason) = run.failed.get(&graph.job(*job).label()) {
+                skipped.push(SkippedImage { name: image.name.clone(), reason: reason.clone() });
+            }
+        }
+        if skipped.len() == folder.skipped.len() + folder.images.len() {
+            let reasons: Vec<String> = skipped.iter().map(|s| format!("{}: {}", s.name, s.reason)).collect();
+            let message = format!("no usable image: {}", reasons.join("; "));
+            return Err(Hinted::error(message, "check the files with an image viewer"));
+        }
+        let Some(hash) = executor.output(jobs.scene) else {
+            let reasons: Vec<String> =
+                run.failed.iter().map(|(job, reason)| format!("{job}: {reason}")).collect();
+            anyhow::bail!("the scene could not be made: {}", reasons.join("; "));
+        };
+        if present == Some(hash) {
+            return Ok(BuildOutcome::Unchanged(run.clone(), skipped));
+        }
+        let scene = executor.load::<SceneFile>(jobs.scene)?;
+        let mut features = BTreeMap::new();
+        for (image, job) in folder.images.iter().zip(&jobs.model.features) {
+            if executor.output(*job).is_some() {
+                features.insert(image.name.clone(), executor.load::<ImageFeatures>(*job)?);
+            }
+        }
+        Ok(BuildOutcome::Built(Box::new(Built { scene, hash, skipped, features, run: run.clone() })))
+    })
+}

@@ -1,0 +1,72 @@
+//! The command line: typed arguments in, exit code out.
+
+mod args;
+mod batch;
+mod bench;
+mod build;
+mod cache;
+mod demo;
+mod export;
+mod locate;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+use crate::error::Hinted;
+use crate::print;
+use args::{Cli, Command};
+
+/// What a command came to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Answer {
+    /// Done.
+    Done,
+    /// It ran, but the answer is negative: not localized, not registered.
+    Negative,
+}
+
+/// Runs the program: exit code 0 done, 1 negative answer, 2 error.
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => error.exit(),
+    };
+    match dispatch(&cli.command) {
+        Ok(Answer::Done) => ExitCode::SUCCESS,
+        Ok(Answer::Negative) => ExitCode::from(1),
+        Err(error) => {
+            show(&error);
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn dispatch(command: &Command) -> anyhow::Result<Answer> {
+    match command {
+        Command::Demo(args) => demo::run(args),
+        Command::Build(args) => build::run(args),
+        Command::Plan(args) => build::plan(args),
+        Command::Locate(args) => locate::run(args),
+        Command::Bench(args) => bench::run(args),
+        Command::Batch(args) => batch::run(args),
+        Command::Export(args) => export::run(args),
+        Command::Explain(args) => cache::explain(args),
+        Command::Cache(args) => cache::run(args),
+    }
+}
+
+/// The chain of causes, one a line, and the hints.
+fn show(error: &anyhow::Error) {
+    let mut last = String::new();
+    for (at, cause) in error.chain().enumerate() {
+        let text = cause.to_string();
+        if text != last {
+            print::note(&format!("{}{text}", if at == 0 { "error: " } else { "  caused by: " }));
+        }
+        last = text;
+    }
+    for hint in error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()) {
+        print::note(&format!("hint: {}", hint.hint()));
+    }
+}

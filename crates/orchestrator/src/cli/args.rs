@@ -1,0 +1,345 @@
+//! What can be typed.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use anyhow::Result;
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+use crate::bench::BenchGps;
+use crate::config::Config;
+use crate::dataset::{CameraBook, GeoSource};
+use crate::locating::Mode;
+use crate::session::{Limits, Session, cache_folder, stop_on_signal};
+
+/// Localizes photos in a place that street-view panoramas have mapped.
+#[derive(Debug, Parser)]
+#[command(name = "setloc", version, max_term_width = 110)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// The commands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Render the sample town, build its scene, locate its photo set and compare with the truth
+    Demo(DemoArgs),
+    /// Build a scene from panoramas (or photos)
+    Build(BuildArgs),
+    /// Show what `build` would run, and why
+    Plan(PlanArgs),
+    /// Locate photos in a scene
+    Locate(LocateArgs),
+    /// Build and locate data sets and compare with their truth
+    Bench(BenchArgs),
+    /// Build many scenes and locate many sets, from a manifest
+    Batch(BatchArgs),
+    /// Write a scene in another format
+    Export(ExportArgs),
+    /// Say what changed for a job or image between the last two runs
+    Explain(ExplainArgs),
+    /// Look after the store of results
+    Cache(CacheArgs),
+}
+
+/// Options of every command that runs jobs.
+#[derive(Debug, Clone, Args)]
+pub struct RunArgs {
+    /// Configuration file (TOML); see --print-config
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Set one parameter, as `two_view.min_inliers=30`; overrides the file
+    #[arg(long = "set", value_name = "STAGE.KEY=VALUE")]
+    pub settings: Vec<String>,
+    /// Seed of everything random
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Most jobs at once [default: all cores]
+    #[arg(long)]
+    pub threads: Option<usize>,
+    /// Memory for the jobs' work, as `8GiB` [default: three quarters of the machine's]
+    #[arg(long, value_parser = parse_bytes)]
+    pub memory: Option<u64>,
+    /// Folder of stored results [default: `.setloc-cache` beside the output]
+    #[arg(long, value_name = "DIR", env = "SETLOC_CACHE")]
+    pub cache: Option<PathBuf>,
+}
+
+impl RunArgs {
+    /// The configuration.
+    pub fn config(&self) -> Result<Config> {
+        Config::resolve(self.config.as_deref(), &self.settings)
+    }
+
+    /// Opens the store; the log is a file in `log_folder`.
+    pub fn session(&self, output: &std::path::Path, log_folder: Option<&std::path::Path>) -> Result<Session> {
+        self.session_with(output, log_folder, &stop_on_signal())
+    }
+
+    /// As [`Self::session`], with a flag that exists already.
+    pub fn session_with(
+        &self,
+        output: &std::path::Path,
+        log_folder: Option<&std::path::Path>,
+        stop: &Arc<AtomicBool>,
+    ) -> Result<Session> {
+        let threads =
+            self.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
+        let threads = threads.max(1);
+        // A pool that exists already, as in a batch, is kept.
+        let _ = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
+        let limits = Limits {
+            threads,
+            memory: self.memory.unwrap_or_else(|| crate::clock::physical_memory() / 4 * 3),
+        };
+        if let Some(folder) = log_folder {
+            crate::store::create_folder(folder)?;
+        }
+        let log = log_folder.map(|folder| folder.join("run.jsonl"));
+        Session::open(&cache_folder(self.cache.as_deref(), output), log.as_deref(), limits, Arc::clone(stop))
+    }
+}
+
+/// What the scene is built from.
+#[derive(Debug, Clone, Args)]
+pub struct SourceArgs {
+    /// Folders with images, or image files
+    pub panoramas: Vec<PathBuf>,
+    /// The scene file to write
+    #[arg(short, long, default_value = "scene.setloc")]
+    pub output: PathBuf,
+    /// Positions: a table `name,lat,lon,alt`, or `exif`
+    #[arg(long, value_name = "geo.csv|exif")]
+    pub gps: Option<String>,
+    /// Folder of mask images, named as the images; black is left out
+    #[arg(long, value_name = "DIR")]
+    pub masks: Option<PathBuf>,
+    /// Known intrinsics
+    #[arg(long, value_name = "cameras.json")]
+    pub cameras: Option<PathBuf>,
+    /// Options of the run
+    #[command(flatten)]
+    pub run: RunArgs,
+}
+
+impl SourceArgs {
+    /// Where positions come from.
+    pub fn geo(&self) -> GeoSource {
+        match self.gps.as_deref() {
+            None => GeoSource::None,
+            Some("exif") => GeoSource::Exif,
+            Some(path) => GeoSource::Table(path.into()),
+        }
+    }
+
+    /// Known intrinsics.
+    pub fn camera_book(&self) -> Result<CameraBook> {
+        Ok(self.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default())
+    }
+}
+
+/// `setloc build`
+#[derive(Debug, Clone, Args)]
+pub struct BuildArgs {
+    /// What from
+    #[command(flatten)]
+    pub source: SourceArgs,
+    /// Folder for poses, point cloud, COLMAP model, picture and log [default: the output without its ending]
+    #[arg(long, value_name = "DIR")]
+    pub export: Option<PathBuf>,
+    /// Print the resolved configuration and stop
+    #[arg(long)]
+    pub print_config: bool,
+}
+
+/// `setloc plan`
+#[derive(Debug, Clone, Args)]
+pub struct PlanArgs {
+    /// What from
+    #[command(flatten)]
+    pub source: SourceArgs,
+    /// How to print it
+    #[arg(long, value_enum, default_value_t)]
+    pub format: PlanFormat,
+}
+
+/// How a plan is printed.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
+pub enum PlanFormat {
+    /// For people
+    #[default]
+    Text,
+    /// For programs
+    Json,
+    /// For Graphviz
+    Dot,
+}
+
+/// `setloc locate`
+#[derive(Debug, Clone, Args)]
+pub struct LocateArgs {
+    /// The scene
+    pub scene: PathBuf,
+    /// Folders with photos, or photo files: one set
+    #[arg(required = true)]
+    pub photos: Vec<PathBuf>,
+    /// The photo that matters [default: the last by name]
+    #[arg(long)]
+    pub target: Option<String>,
+    /// Methods to try
+    #[arg(long, value_enum, default_value_t)]
+    pub mode: Mode,
+    /// Known intrinsics
+    #[arg(long, value_name = "cameras.json")]
+    pub cameras: Option<PathBuf>,
+    /// Folder for the results
+    #[arg(short, long, default_value = "out")]
+    pub output: PathBuf,
+    /// Options of the run
+    #[command(flatten)]
+    pub run: RunArgs,
+}
+
+/// `setloc bench`
+#[derive(Debug, Clone, Args)]
+pub struct BenchArgs {
+    /// Data sets
+    #[arg(required = true)]
+    pub datasets: Vec<PathBuf>,
+    /// Folder for the results
+    #[arg(short, long, default_value = "out")]
+    pub output: PathBuf,
+    /// Positions given to the scene
+    #[arg(long, value_enum, default_value_t)]
+    pub gps: BenchGps,
+    /// Options of the run; without --cache nothing is reused, so that times are those of the whole work
+    #[command(flatten)]
+    pub run: RunArgs,
+}
+
+/// `setloc batch`
+#[derive(Debug, Clone, Args)]
+pub struct BatchArgs {
+    /// The manifest (TOML)
+    pub manifest: PathBuf,
+    /// Folder for the results
+    #[arg(short, long, default_value = "out")]
+    pub output: PathBuf,
+    /// Options of the run
+    #[command(flatten)]
+    pub run: RunArgs,
+}
+
+/// `setloc demo`
+#[derive(Debug, Clone, Args)]
+pub struct DemoArgs {
+    /// Folder for the town and the results
+    #[arg(short, long, default_value = "out/demo")]
+    pub output: PathBuf,
+    /// Options of the run
+    #[command(flatten)]
+    pub run: RunArgs,
+}
+
+/// `setloc export`
+#[derive(Debug, Clone, Args)]
+pub struct ExportArgs {
+    /// The scene
+    pub scene: PathBuf,
+    /// The format
+    #[arg(long, value_enum)]
+    pub format: ExportFormat,
+    /// File, or folder for COLMAP [default: standard output]
+    #[arg(short, long)]
+    pub output: Option<PathBuf>,
+}
+
+/// Formats of a scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ExportFormat {
+    /// COLMAP's text model (a folder)
+    Colmap,
+    /// Point cloud
+    Ply,
+    /// nerfstudio's transforms.json
+    Nerfstudio,
+    /// Camera positions on the map
+    Geojson,
+    /// All poses
+    Json,
+    /// Picture from above (PNG)
+    TopView,
+}
+
+/// `setloc explain`
+#[derive(Debug, Clone, Args)]
+pub struct ExplainArgs {
+    /// A job as `features panoramas/a.jpg`, or a part of its name
+    pub job: String,
+    /// Folder of stored results
+    #[arg(long, value_name = "DIR", env = "SETLOC_CACHE", default_value = ".setloc-cache")]
+    pub cache: PathBuf,
+}
+
+/// `setloc cache`
+#[derive(Debug, Clone, Args)]
+pub struct CacheArgs {
+    /// What to do
+    #[command(subcommand)]
+    pub command: CacheCommand,
+    /// Folder of stored results
+    #[arg(long, global = true, value_name = "DIR", env = "SETLOC_CACHE", default_value = ".setloc-cache")]
+    pub cache: PathBuf,
+}
+
+/// `setloc cache …`
+#[derive(Debug, Clone, Subcommand)]
+pub enum CacheCommand {
+    /// Count and size by kind
+    Ls,
+    /// Remove what the last runs do not use
+    Gc {
+        /// Also remove the oldest results until at most this is left
+        #[arg(long, value_parser = parse_bytes)]
+        max: Option<u64>,
+    },
+    /// Check every stored result; damaged ones are removed
+    Verify,
+}
+
+/// `8GiB`, `500MB`, `1024`.
+pub fn parse_bytes(text: &str) -> Result<u64, String> {
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let unit = match text[digits.len()..].to_ascii_lowercase().as_str() {
+        "" | "b" => 1,
+        "k" | "kib" => 1 << 10,
+        "kb" => 1000,
+        "m" | "mib" => 1 << 20,
+        "mb" => 1_000_000,
+        "g" | "gib" => 1 << 30,
+        "gb" => 1_000_000_000,
+        other => return Err(format!("unknown unit `{other}`: use MiB, GiB, MB or GB")),
+    };
+    let number: f64 = digits.trim().parse().map_err(|_| format!("`{text}` is no size: write it as 8GiB"))?;
+    if number > 0.0 { Ok((number * unit as f64) as u64) } else { Err("must be more than 0".to_owned()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn arguments_are_consistent() {
+        <Cli as clap::CommandFactory>::command().debug_assert();
+    }
+
+    #[test]
+    fn sizes_are_read_with_their_unit() {
+        assert_eq!(parse_bytes("8GiB").unwrap(), 8 << 30);
+        assert_eq!(parse_bytes("1.5MB").unwrap(), 1_500_000);
+        assert!(parse_bytes("8 apples").is_err() && parse_bytes("-1").is_err());
+    }
+}

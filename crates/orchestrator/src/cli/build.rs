@@ -1,0 +1,179 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use setloc_features::ImageFeatures;
+use setloc_sfm::Reconstruction;
+
+use super::Answer;
+use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
+use crate::building::{BuildOutcome, Built, build_scene};
+use crate::codec;
+use crate::dataset::{ImageFolder, SkippedImage, list_images};
+use crate::error::Hinted;
+use crate::export::{Marker, ply, scene_json, top_view_png, write_colmap};
+use crate::fingerprint::ContentHash;
+use crate::graph::{JobGraph, Prediction};
+use crate::jobs::add_scene;
+use crate::print;
+use crate::scene::SceneFile;
+use crate::session::{Session, cache_folder};
+use crate::store::{Store, write_atomically};
+
+/// Blue, for cameras of the scene.
+pub const SCENE_COLOR: [u8; 3] = [30, 90, 220];
+
+/// `setloc build`
+pub fn run(args: &BuildArgs) -> Result<Answer> {
+    let config = args.source.run.config()?;
+    if args.print_config {
+        print::data(config.to_toml()?.trim_end());
+        return Ok(Answer::Done);
+    }
+    let folder = read_sources(&args.source)?;
+    let output = &args.source.output;
+    let export = args.export.clone().unwrap_or_else(|| export_folder(output));
+    let session = args.source.run.session(output, Some(&export))?;
+    let present = std::fs::read(output).ok().map(|bytes| ContentHash::of(&bytes));
+    let present = present.filter(|_| export.join("report.json").is_file());
+    let outcome = build_scene(&session, &folder, &config, args.source.run.seed, &run_name(output), present)?;
+    let (run, skipped) = match &outcome {
+        BuildOutcome::Unchanged(run, skipped) => {
+            print::note(&format!("{} is up to date: nothing changed", output.display()));
+            (run, skipped)
+        }
+        BuildOutcome::Built(built) => {
+            write_atomically(output, &codec::encode(&*built.scene)?)?;
+            write_exports(&export, built, &session)?;
+            summarize(&built.scene, folder.images.len() + folder.skipped.len());
+            (&built.run, &built.skipped)
+        }
+    };
+    warn_skipped(skipped);
+    let (wall, cpu) = session.report.totals();
+    let (ran, hits) = (run.ran.len(), run.hits);
+    print::note(&format!("{ran} jobs ran, {hits} came from the cache; {wall:.1} s, {cpu:.1} CPU s"));
+    print::note(&format!("wrote {} and {}/", output.display(), export.display()));
+    let registered = match &outcome {
+        BuildOutcome::Built(built) => built.scene.main().is_some(),
+        BuildOutcome::Unchanged(..) => SceneFile::read(output)?.0.main().is_some(),
+    };
+    Ok(if registered { Answer::Done } else { Answer::Negative })
+}
+
+/// `setloc plan`
+pub fn plan(args: &PlanArgs) -> Result<Answer> {
+    let config = args.source.run.config()?;
+    let folder = read_sources(&args.source)?;
+    let mut graph = JobGraph::default();
+    add_scene(&mut graph, &folder.images, &config, args.source.run.seed)?;
+    if args.format == PlanFormat::Dot {
+        print::data(graph.to_dot().trim_end());
+        return Ok(Answer::Done);
+    }
+    let store = Store::open(&cache_folder(args.source.run.cache.as_deref(), &args.source.output))?;
+    let planned = graph.plan(&store, &store.run(&run_name(&args.source.output)));
+    if args.format == PlanFormat::Json {
+        print::data(&serde_json::to_string_pretty(&planned)?);
+        return Ok(Answer::Done);
+    }
+    for job in planned.iter().filter(|job| job.prediction == Prediction::Runs) {
+        print::data(&format!("runs     {} {}: {}", job.kind, job.job, job.reasons.join("; ")));
+    }
+    for job in planned.iter().filter(|job| job.prediction == Prediction::Follows) {
+        let (first, more) = (&job.reasons[0], job.reasons.len() - 1);
+        let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+        print::data(&format!("follows  {} {}: {first}{more}", job.kind, job.job));
+    }
+    let count = |what| planned.iter().filter(|job| job.prediction == what).count();
+    let (runs, follows, stored) =
+        (count(Prediction::Runs), count(Prediction::Follows), count(Prediction::Stored));
+    print::data(&format!("{runs} jobs run, {follows} depend on them, {stored} are stored"));
+    Ok(Answer::Done)
+}
+
+fn read_sources(source: &SourceArgs) -> Result<ImageFolder> {
+    if source.panoramas.is_empty() {
+        return Err(Hinted::error(
+            "no panoramas given",
+            "name a folder: setloc build PANORAMAS -o scene.setloc",
+        ));
+    }
+    let files = list_images(&source.panoramas)?;
+    ImageFolder::read(&files, &source.camera_book()?, &source.geo(), source.masks.as_deref())
+}
+
+/// Name of the run that makes a scene file.
+fn run_name(output: &Path) -> String {
+    format!("build {}", output.file_name().unwrap_or_default().to_string_lossy())
+}
+
+/// The scene file's name without its ending, or with `-export` when it has none.
+fn export_folder(output: &Path) -> PathBuf {
+    let folder = output.with_extension("");
+    if folder == output { PathBuf::from(format!("{}-export", output.display())) } else { folder }
+}
+
+/// Blue markers for the registered images of a model.
+pub fn scene_markers(model: &Reconstruction) -> Vec<Marker> {
+    let marker = |id: setloc_sfm::ImageId| {
+        let directed = !model.camera_of(id).is_panoramic();
+        let pose = model.images[id.index()].world_from_camera;
+        pose.map(|world_from_camera| Marker { world_from_camera, color: SCENE_COLOR, directed })
+    };
+    model.registered().filter_map(marker).collect()
+}
+
+/// Poses, point cloud, COLMAP model, picture and report.
+pub fn write_exports(folder: &Path, built: &Built, session: &Session) -> Result<()> {
+    let empty = Reconstruction::default();
+    let model = built.scene.main().unwrap_or(&empty);
+    let markers = scene_markers(model);
+    let centres: Vec<_> =
+        markers.iter().map(|marker| (marker.world_from_camera.translation, marker.color)).collect();
+    let features: Vec<Option<&ImageFeatures>> = model
+        .images
+        .iter()
+        .map(|image| built.features.get(&image.name).map(|features| &**features))
+        .collect();
+    write_json(&folder.join("poses.json"), &scene_json(&built.scene))?;
+    write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes())?;
+    write_colmap(&folder.join("colmap"), model, &features)?;
+    write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?)?;
+    let mut report = session.report.to_json();
+    report["scene"] = serde_json::json!(built.hash);
+    report["skipped"] = serde_json::json!(built.skipped);
+    report["warnings"] = serde_json::json!(built.scene.warnings);
+    write_json(&folder.join("report.json"), &report)
+}
+
+/// Readable JSON.
+pub fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<()> {
+    write_atomically(path, (serde_json::to_string_pretty(value)? + "\n").as_bytes())
+}
+
+/// Says what a scene is.
+pub fn summarize(scene: &SceneFile, images: usize) {
+    match scene.main() {
+        Some(model) => print::note(&format!(
+            "scene: {}/{images} images, {} components, {} points, {} observations",
+            model.registered().count(),
+            scene.components.len(),
+            model.points.len(),
+            model.observation_count()
+        )),
+        None => print::note(&format!("scene: 0/{images} images could be registered")),
+    }
+    for warning in &scene.warnings {
+        print::note(&format!("warning: {warning}"));
+    }
+}
+
+/// Says which images were left out.
+pub fn warn_skipped(skipped: &[SkippedImage]) {
+    for image in skipped {
+        print::note(&format!("skipped {}: {}", image.name, image.reason));
+    }
+    if !skipped.is_empty() {
+        print::note(&format!("{} images skipped", skipped.len()));
+    }
+}

@@ -1,0 +1,87 @@
+use std::path::Path;
+
+use anyhow::Result;
+
+use super::Answer;
+use super::args::{CacheArgs, CacheCommand, ExplainArgs};
+use crate::error::Hinted;
+use crate::print;
+use crate::store::Store;
+
+/// A store that is there already: a mistyped folder must not be made.
+fn existing(folder: &Path) -> Result<Store> {
+    if folder.join("objects").is_dir() {
+        return Store::open(folder);
+    }
+    let message = format!("{} is no store of results", folder.display());
+    Err(Hinted::error(
+        message,
+        "name it with --cache DIR or SETLOC_CACHE; `build` makes `.setloc-cache` beside its output",
+    ))
+}
+
+/// `setloc cache`
+pub fn run(args: &CacheArgs) -> Result<Answer> {
+    let store = existing(&args.cache)?;
+    match args.command {
+        CacheCommand::Ls => {
+            let summary = store.summary()?;
+            for (kind, (count, bytes)) in &summary.kinds {
+                print::data(&format!("{kind}\t{count}\t{}", mebibytes(*bytes)));
+            }
+            print::data(&format!("all objects\t\t{}", mebibytes(summary.bytes)));
+            if summary.orphans > 0 {
+                print::data(&format!(
+                    "{} objects belong to no job; `setloc cache gc` removes them",
+                    summary.orphans
+                ));
+            }
+        }
+        CacheCommand::Gc { max } => {
+            let (count, bytes) = store.collect_garbage(max)?;
+            print::data(&format!("removed {count} objects, {}", mebibytes(bytes)));
+        }
+        CacheCommand::Verify => {
+            let damaged = store.verify()?;
+            for name in &damaged {
+                print::data(&format!("damaged, removed: {name}"));
+            }
+            print::data(&format!("{} damaged objects", damaged.len()));
+            return Ok(if damaged.is_empty() { Answer::Done } else { Answer::Negative });
+        }
+    }
+    Ok(Answer::Done)
+}
+
+fn mebibytes(bytes: u64) -> String {
+    format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
+}
+
+/// `setloc explain`
+pub fn explain(args: &ExplainArgs) -> Result<Answer> {
+    let store = existing(&args.cache)?;
+    let mut found = false;
+    for run in store.runs()? {
+        let record = store.run(&run);
+        for (label, key) in record.jobs.iter().filter(|(label, _)| label.contains(&args.job)) {
+            found = true;
+            let now = store.record(*key);
+            let before = record.previous.get(label).and_then(|key| store.record(*key));
+            let text = match (now, before) {
+                (Some(_), _) if record.previous.get(label) == Some(key) => "nothing changed".to_owned(),
+                (Some(now), Some(before)) => now.fingerprint.changes_since(&before.fingerprint).join("; "),
+                (Some(_), None) if record.previous.is_empty() => "the first run".to_owned(),
+                (Some(_), None) => "was not in the run before".to_owned(),
+                (None, _) => "its fingerprint is no longer kept".to_owned(),
+            };
+            print::data(&format!("{run}: {label}: {text}"));
+        }
+    }
+    if found {
+        return Ok(Answer::Done);
+    }
+    Err(Hinted::error(
+        format!("no job of the last runs is named like `{}`", args.job),
+        "`setloc plan` lists all jobs",
+    ))
+}

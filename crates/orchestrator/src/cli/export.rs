@@ -1,0 +1,55 @@
+use anyhow::{Context, Result};
+use setloc_sfm::Reconstruction;
+
+use super::Answer;
+use super::args::{ExportArgs, ExportFormat};
+use super::build::scene_markers;
+use crate::error::Hinted;
+use crate::export::{geojson, nerfstudio, ply, scene_json, top_view_png, write_colmap};
+use crate::print;
+use crate::scene::SceneFile;
+use crate::store::write_atomically;
+
+/// `setloc export`
+pub fn run(args: &ExportArgs) -> Result<Answer> {
+    let (scene, _) = SceneFile::read(&args.scene)?;
+    let empty = Reconstruction::default();
+    let model = scene.main().unwrap_or(&empty);
+    let needs_output =
+        || Hinted::error("this format is not written to standard output", "name a file or folder with -o");
+    let markers = scene_markers(model);
+    let text = match args.format {
+        ExportFormat::Colmap => {
+            let folder = args.output.as_deref().ok_or_else(needs_output)?;
+            write_colmap(folder, model, &[]).context("cannot write the COLMAP model")?;
+            print::note(&format!("wrote {}/", folder.display()));
+            return Ok(Answer::Done);
+        }
+        ExportFormat::TopView => {
+            let file = args.output.as_deref().ok_or_else(needs_output)?;
+            write_atomically(file, &top_view_png(model, &markers)?)?;
+            print::note(&format!("wrote {}", file.display()));
+            return Ok(Answer::Done);
+        }
+        ExportFormat::Ply => {
+            let centres: Vec<_> =
+                markers.iter().map(|m| (m.world_from_camera.translation, m.color)).collect();
+            ply(model, &centres)
+        }
+        ExportFormat::Nerfstudio => serde_json::to_string_pretty(&nerfstudio(model))?,
+        ExportFormat::Json => serde_json::to_string_pretty(&scene_json(&scene))?,
+        ExportFormat::Geojson => {
+            let poses =
+                model.images.iter().filter_map(|image| Some((image.name.clone(), image.world_from_camera?)));
+            serde_json::to_string_pretty(&geojson(&poses.collect::<Vec<_>>(), scene.origin)?)?
+        }
+    };
+    match &args.output {
+        Some(file) => {
+            write_atomically(file, text.as_bytes())?;
+            print::note(&format!("wrote {}", file.display()));
+        }
+        None => print::data(text.trim_end()),
+    }
+    Ok(Answer::Done)
+}

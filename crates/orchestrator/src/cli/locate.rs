@@ -1,0 +1,135 @@
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::Result;
+use serde_json::json;
+use setloc_camset::{PhotoLocalization, Verdict};
+use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage};
+
+use super::Answer;
+use super::args::LocateArgs;
+use super::build::{scene_markers, warn_skipped, write_json};
+use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
+use crate::error::Hinted;
+use crate::export::{Marker, localizations_json, ply, top_view_png, write_colmap};
+use crate::jobs::LocateJobs;
+use crate::locating::{Located, locate};
+use crate::print;
+use crate::scene::SceneFile;
+use crate::session::Session;
+use crate::store::write_atomically;
+
+/// Red, for the target.
+const TARGET_COLOR: [u8; 3] = [220, 30, 30];
+/// Orange, for the other photos.
+const PHOTO_COLOR: [u8; 3] = [240, 150, 0];
+
+/// `setloc locate`
+pub fn run(args: &LocateArgs) -> Result<Answer> {
+    let config = args.run.config()?;
+    let (scene, scene_hash) = SceneFile::read(&args.scene)?;
+    let files = list_images(&args.photos)?;
+    let target = find_target(args.target.as_deref(), &files)?;
+    let cameras = args.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default();
+    let photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
+    // Results of photos are kept beside the scene, where those of its images are.
+    let session = args.run.session(&args.scene, Some(&args.output))?;
+    let what = LocateJobs { scene: Arc::new(scene), scene_hash, config, seed: args.run.seed };
+    let name = format!("locate {}", args.output.file_name().unwrap_or_default().to_string_lossy());
+    let located = locate(&session, &photos, &what, args.mode, &name, &target)?;
+    write_results(&args.output, &located, &what.scene, &target, &session)?;
+    warn_skipped(&located.skipped);
+    let answers = located.answers();
+    for (method, photo) in &answers {
+        print::data(&line(method, photo));
+    }
+    for advice in located.set.iter().flat_map(|set| &set.advice) {
+        print::note(&format!("advice: {advice}"));
+    }
+    print::note(&format!("wrote {}/", args.output.display()));
+    let found = answers.iter().any(|(_, photo)| photo.name == target && photo.verdict == Verdict::Localized);
+    print::note(&format!("target {target}: {}", if found { "localized" } else { "not localized" }));
+    Ok(if found { Answer::Done } else { Answer::Negative })
+}
+
+/// The photo of that name, or the last by name.
+fn find_target(wanted: Option<&str>, files: &[(String, std::path::PathBuf)]) -> Result<String> {
+    let names = || files.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>().join(", ");
+    let found = match wanted {
+        Some(wanted) => {
+            files.iter().find(|(name, _)| name == wanted || name.ends_with(&format!("/{wanted}")))
+        }
+        None => files.last(),
+    };
+    found.map(|(name, _)| name.clone()).ok_or_else(|| {
+        Hinted::error(
+            format!("no photo is named {}", wanted.unwrap_or_default()),
+            format!("the photos are {}", names()),
+        )
+    })
+}
+
+/// Tab-separated: name, verdict, method, inliers, centre, rotation.
+pub fn line(method: &str, photo: &PhotoLocalization) -> String {
+    let verdict = match photo.verdict {
+        Verdict::Localized => "localized",
+        Verdict::Uncertain => "uncertain",
+        Verdict::NotLocalized => "not localized",
+    };
+    let pose = photo.world_from_camera.as_ref().map_or_else(String::new, |pose| {
+        let (c, q) = (pose.translation, pose.rotation.quaternion());
+        format!("\t{:.4} {:.4} {:.4}\t{:.6} {:.6} {:.6} {:.6}", c.x, c.y, c.z, q.w, q.i, q.j, q.k)
+    });
+    format!("{}\t{verdict}\t{method}\t{}{pose}", photo.name, photo.inliers)
+}
+
+/// Poses, point cloud, COLMAP model, picture and report.
+pub fn write_results(
+    folder: &Path,
+    located: &Located,
+    scene: &SceneFile,
+    target: &str,
+    session: &Session,
+) -> Result<()> {
+    let answers = located.answers();
+    let best: Vec<PhotoLocalization> = answers.iter().map(|(_, photo)| (*photo).clone()).collect();
+    let set = located.set.as_ref();
+    let of_set = |photos: Option<&Vec<PhotoLocalization>>| {
+        localizations_json(photos.map_or(&[], Vec::as_slice), scene.origin)
+    };
+    let mut photos = localizations_json(&best, scene.origin);
+    for (photo, (method, _)) in photos.as_array_mut().into_iter().flatten().zip(&answers) {
+        photo["method"] = json!(method);
+    }
+    write_json(
+        &folder.join("poses.json"),
+        &json!({
+            "convention": "X_world = R(q) X_camera + center; camera x right, y down, z forward",
+            "target": target, "geo_origin": scene.origin, "photos": photos,
+            "methods": {
+                "single": localizations_json(&located.single, scene.origin),
+                "camset": of_set(set.map(|set| &set.rigid)), "camset+opt": of_set(set.map(|set| &set.refined)),
+            },
+            "local_models": located.local_models, "advice": set.map(|set| &set.advice), "skipped": located.skipped,
+        }),
+    )?;
+    let empty = Reconstruction::default();
+    let model = scene.main().unwrap_or(&empty);
+    let mut markers = scene_markers(model);
+    let mut merged = model.clone();
+    for photo in &best {
+        let Some(world_from_camera) = photo.world_from_camera else { continue };
+        let color = if photo.name == target { TARGET_COLOR } else { PHOTO_COLOR };
+        markers.push(Marker { world_from_camera, color, directed: true });
+        let camera = CameraId(merged.cameras.len() as u32);
+        merged.cameras.push(photo.camera.clone());
+        let name = photo.name.clone();
+        merged.images.push(ReconstructionImage { name, camera, world_from_camera: Some(world_from_camera) });
+    }
+    let centres: Vec<_> =
+        markers.iter().map(|marker| (marker.world_from_camera.translation, marker.color)).collect();
+    write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes())?;
+    write_colmap(&folder.join("colmap"), &merged, &[])?;
+    write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?)?;
+    write_json(&folder.join("report.json"), &session.report.to_json())
+}

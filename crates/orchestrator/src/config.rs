@@ -1,0 +1,144 @@
+//! One configuration: every stage's parameters under its name. Flags override the file, the file the defaults.
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use serde::{Deserialize, Serialize};
+use setloc_camset::{CamsetParams, SingleParams};
+use setloc_index::IndexParams;
+use setloc_sfm::{MapperParams, TwoViewParams};
+
+use crate::error::Hinted;
+use crate::stages::{FeatureParams, MatchParams};
+
+/// Parameters of all stages.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Detection and description.
+    pub features: FeatureParams,
+    /// Which pairs are matched.
+    pub pairs: PairParams,
+    /// Two-nearest-neighbour matching.
+    pub matching: MatchParams,
+    /// Verification on the sphere.
+    pub two_view: TwoViewParams,
+    /// Mapping of the scene and of local models.
+    pub sfm: MapperParams,
+    /// The scene's index.
+    pub index: IndexParams,
+    /// Localization of one photo.
+    pub single: SingleParams,
+    /// Localization of a set.
+    pub camset: CamsetParams,
+}
+
+/// Which pairs of images are matched.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PairParams {
+    /// Up to this many images all pairs are matched.
+    pub exhaustive_up_to: usize,
+    /// Above that, each image is matched with this many next ones in the order of names.
+    pub window: usize,
+    /// Above that, each image is also matched with this many nearest ones by measured position.
+    pub nearest: usize,
+}
+
+impl Default for PairParams {
+    fn default() -> Self {
+        Self { exhaustive_up_to: 60, window: 8, nearest: 16 }
+    }
+}
+
+impl Config {
+    /// Defaults, then the file, then `key=value` settings such as `two_view.min_inliers=30`.
+    ///
+    /// # Errors
+    /// With file, line, key and the allowed names when something is unknown or of the wrong type.
+    pub fn resolve(file: Option<&Path>, settings: &[String]) -> Result<Self> {
+        let mut table = match file {
+            Some(path) => {
+                let text = std::fs::read_to_string(path)
+                    .with_context(|| format!("cannot read {}", path.display()))?;
+                // Checked on its own first, so that the error shows the line in the file.
+                toml::from_str::<Self>(&text)
+                    .with_context(|| format!("{} is not a valid configuration", path.display()))?;
+                toml::from_str::<toml::Table>(&text)?
+            }
+            None => toml::Table::new(),
+        };
+        for setting in settings {
+            apply(&mut table, setting)?;
+        }
+        let text = toml::to_string(&table)?;
+        toml::from_str(&text).map_err(|error| {
+            let message = format!("invalid setting: {}", error.message());
+            Hinted::error(message, "`setloc build --print-config` lists all keys with their values")
+        })
+    }
+
+    /// As TOML.
+    ///
+    /// # Errors
+    /// When a value has no TOML form.
+    pub fn to_toml(&self) -> Result<String> {
+        Ok(toml::to_string_pretty(self)?)
+    }
+}
+
+/// Puts one `a.b=value` into a table.
+fn apply(table: &mut toml::Table, setting: &str) -> Result<()> {
+    let wrong = || Hinted::error(format!("`{setting}` is no setting"), "write it as --set stage.key=value");
+    let (key, value) = setting.split_once('=').ok_or_else(wrong)?;
+    let value = parse_value(value.trim());
+    let mut parts: Vec<&str> = key.trim().split('.').collect();
+    let last = parts.pop().filter(|last| !last.is_empty()).ok_or_else(wrong)?;
+    let mut at = table;
+    for part in parts {
+        let next = at.entry(part).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+        at = next.as_table_mut().ok_or_else(wrong)?;
+    }
+    at.insert(last.to_owned(), value);
+    Ok(())
+}
+
+/// A TOML value; what is none is a string.
+fn parse_value(text: &str) -> toml::Value {
+    let parsed = toml::from_str::<toml::Table>(&format!("value = {text}")).ok();
+    parsed.and_then(|mut table| table.remove("value")).unwrap_or_else(|| toml::Value::String(text.to_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_override_the_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("setloc.toml");
+        std::fs::write(&path, "[two_view]\nmin_inliers = 30\n[pairs]\nwindow = 3\n").unwrap();
+        let config = Config::resolve(Some(&path), &["two_view.min_inliers=40".to_owned()]).unwrap();
+        assert_eq!((config.two_view.min_inliers, config.pairs.window), (40, 3));
+    }
+
+    #[test]
+    fn unknown_keys_are_named_with_the_line_and_the_allowed_ones() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("setloc.toml");
+        std::fs::write(&path, "[pairs]\nwindw = 3\n").unwrap();
+        let error = format!("{:#}", Config::resolve(Some(&path), &[]).unwrap_err());
+        assert!(
+            error.contains("setloc.toml") && error.contains("line 2") && error.contains("window"),
+            "{error}"
+        );
+        assert!(Config::resolve(None, &["pairs.windw=3".to_owned()]).is_err());
+        assert!(Config::resolve(None, &["pairs.window=many".to_owned()]).is_err());
+    }
+
+    #[test]
+    fn printed_config_reads_back() {
+        let text = Config::default().to_toml().unwrap();
+        assert_eq!(toml::from_str::<Config>(&text).unwrap(), Config::default());
+    }
+}

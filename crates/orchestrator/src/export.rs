@@ -1,0 +1,15 @@
+//! Scenes and poses as files that people and other programs read.
+
+mod colmap;
+mod geojson;
+mod nerfstudio;
+mod ply;
+mod poses;
+mod top_view;
+
+pub use colmap::write_colmap;
+pub use geojson::geojson;
+pub use nerfstudio::nerfstudio;
+pub use ply::ply;
+pub use poses::{localizations_json, pose_json, scene_json};
+pub use top_view::{Marker, top_view_png};

@@ -1,0 +1,64 @@
+use serde_json::{Value, json};
+use setloc_camset::PhotoLocalization;
+use setloc_sfm::{ImageId, Rigid};
+
+use crate::geodesy::Wgs84;
+use crate::scene::SceneFile;
+
+/// `world_from_camera` as quaternion (w, x, y, z) and centre.
+pub fn pose_json(pose: &Rigid) -> Value {
+    let (q, c) = (pose.rotation.quaternion(), pose.translation);
+    json!({ "q_wxyz": [q.w, q.i, q.j, q.k], "center": [c.x, c.y, c.z] })
+}
+
+/// All cameras and poses of a scene.
+pub fn scene_json(scene: &SceneFile) -> Value {
+    let components: Vec<Value> = scene.components.iter().map(|model| {
+        let observations = observations_of(model);
+        let images: Vec<Value> = (0..model.images.len() as u32).map(ImageId).map(|id| {
+            let image = &model.images[id.index()];
+            let pose = image.world_from_camera.as_ref();
+            let place = pose.zip(scene.origin).map(|(pose, origin)| Wgs84::from_enu(&pose.translation, origin));
+            json!({
+                "name": image.name, "world_from_camera": pose.map(pose_json), "wgs84": place,
+                "camera": model.camera_of(id), "observations": observations[id.index()],
+            })
+        }).collect();
+        json!({ "points": model.points.len(), "observations": model.observation_count(), "images": images })
+    }).collect();
+    json!({
+        "convention": "X_world = R(q) X_camera + center; camera x right, y down, z forward; pixel (0.5, 0.5) is the first pixel's centre",
+        "geo_origin": scene.origin, "components": components, "warnings": scene.warnings,
+    })
+}
+
+fn observations_of(model: &setloc_sfm::Reconstruction) -> Vec<usize> {
+    let mut counts = vec![0; model.images.len()];
+    for observation in model.points.iter().flat_map(|point| &point.track) {
+        counts[observation.image.index()] += 1;
+    }
+    counts
+}
+
+/// Localized photos: pose, camera, verdict, evidence; one sigma in degrees and scene units.
+pub fn localizations_json(photos: &[PhotoLocalization], origin: Option<Wgs84>) -> Value {
+    let one = |photo: &PhotoLocalization| {
+        let pose = photo.world_from_camera.as_ref();
+        let place = pose.zip(origin).map(|(pose, origin)| Wgs84::from_enu(&pose.translation, origin));
+        let covariance = photo
+            .covariance
+            .map(|c| c.row_iter().map(|row| row.iter().copied().collect::<Vec<f64>>()).collect::<Vec<_>>());
+        let sigma = photo.covariance.map(|c| {
+            let spread = |from: usize| {
+                (c[(from, from)] + c[(from + 1, from + 1)] + c[(from + 2, from + 2)]).max(0.0).sqrt()
+            };
+            json!({ "rotation_deg": spread(0).to_degrees(), "position": spread(3) })
+        });
+        json!({
+            "name": photo.name, "verdict": photo.verdict, "reasons": photo.reasons, "inliers": photo.inliers,
+            "world_from_camera": pose.map(pose_json), "wgs84": place, "camera": photo.camera,
+            "covariance_rotation_rad_then_centre": covariance, "sigma": sigma,
+        })
+    };
+    photos.iter().map(one).collect()
+}

@@ -1,0 +1,88 @@
+//! WGS84 to local east-north-up metres and back.
+
+use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
+
+/// Semi-major axis of WGS84 in metres.
+const A: f64 = 6_378_137.0;
+/// First eccentricity squared of WGS84.
+const E2: f64 = 6.694_379_990_141_316_5e-3;
+
+/// A place: degrees and metres above the ellipsoid.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Wgs84 {
+    /// Latitude in degrees.
+    pub lat: f64,
+    /// Longitude in degrees.
+    pub lon: f64,
+    /// Metres above the ellipsoid.
+    pub alt: f64,
+}
+
+impl Wgs84 {
+    /// Earth-centred coordinates in metres.
+    fn to_ecef(self) -> Vector3<f64> {
+        let (lat, lon) = (self.lat.to_radians(), self.lon.to_radians());
+        let n = A / (1.0 - E2 * lat.sin().powi(2)).sqrt();
+        let r = (n + self.alt) * lat.cos();
+        Vector3::new(r * lon.cos(), r * lon.sin(), (n * (1.0 - E2) + self.alt) * lat.sin())
+    }
+
+    /// Rows east, north, up in earth-centred axes.
+    fn enu_from_ecef(self) -> Matrix3<f64> {
+        let ((s, c), (sl, cl)) = (self.lat.to_radians().sin_cos(), self.lon.to_radians().sin_cos());
+        Matrix3::new(-sl, cl, 0.0, -s * cl, -s * sl, c, c * cl, c * sl, s)
+    }
+
+    /// East, north, up in metres about `origin`.
+    pub fn to_enu(self, origin: Self) -> Vector3<f64> {
+        origin.enu_from_ecef() * (self.to_ecef() - origin.to_ecef())
+    }
+
+    /// The place of a point given east, north, up in metres about `origin`.
+    ///
+    /// Bowring's fixed point on the latitude; below 1e-9 m within 10 km of the ellipsoid.
+    pub fn from_enu(enu: &Vector3<f64>, origin: Self) -> Self {
+        let ecef = origin.enu_from_ecef().transpose() * enu + origin.to_ecef();
+        let p = ecef.x.hypot(ecef.y);
+        let mut lat = ecef.z.atan2(p * (1.0 - E2));
+        for _ in 0..8 {
+            let n = A / (1.0 - E2 * lat.sin().powi(2)).sqrt();
+            lat = (ecef.z + E2 * n * lat.sin()).atan2(p);
+        }
+        let n = A / (1.0 - E2 * lat.sin().powi(2)).sqrt();
+        let alt = p * lat.cos() + ecef.z * lat.sin() - A * A / n;
+        Self { lat: lat.to_degrees(), lon: ecef.y.atan2(ecef.x).to_degrees(), alt }
+    }
+
+    /// Whether the numbers can be a place on earth.
+    pub fn is_valid(self) -> bool {
+        self.lat.abs() <= 90.0 && self.lon.abs() <= 360.0 && self.alt.is_finite()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn round_trip_is_exact() {
+        let origin = Wgs84 { lat: 48.8566, lon: 2.3522, alt: 35.0 };
+        for enu in [
+            Vector3::new(0.0, 0.0, 0.0),
+            Vector3::new(120.0, -340.0, 12.0),
+            Vector3::new(-4000.0, 9000.0, -30.0),
+        ] {
+            let back = Wgs84::from_enu(&enu, origin).to_enu(origin);
+            assert!((back - enu).norm() < 1e-6, "{enu} {back}");
+        }
+    }
+
+    #[test]
+    fn one_arc_second_north_is_31_metres() {
+        let origin = Wgs84 { lat: 48.8566, lon: 2.3522, alt: 35.0 };
+        let north = Wgs84 { lat: origin.lat + 1.0 / 3600.0, ..origin }.to_enu(origin);
+        assert!((north.y - 30.89).abs() < 0.01 && north.x.abs() < 1e-6, "{north}");
+    }
+}

@@ -1,0 +1,354 @@
+//! Runs a graph: dependency counting on rayon within a memory budget.
+
+use std::any::Any;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+
+use super::events::{Event, Observer};
+use super::job::{Inputs, JobGraph, JobId, Product};
+use crate::clock;
+use crate::codec::{self, Artifact};
+use crate::error::Interrupted;
+use crate::fingerprint::{ContentHash, Fingerprint};
+use crate::store::Store;
+
+/// How to run.
+pub struct RunOptions<'a> {
+    /// Where results are kept.
+    pub store: &'a Store,
+    /// Who is told.
+    pub observer: &'a dyn Observer,
+    /// Most jobs at once.
+    pub threads: usize,
+    /// Most working memory of the jobs at once, in bytes; a job that alone exceeds it runs alone.
+    pub memory: u64,
+    /// Set from outside to stop.
+    pub stop: &'a AtomicBool,
+}
+
+/// What became of a job.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum State {
+    /// Not yet decided.
+    Waiting,
+    /// The result was in the store.
+    Hit,
+    /// It ran.
+    Ran,
+    /// It failed, for this reason.
+    Failed(String),
+    /// A job whose result it requires failed.
+    Skipped,
+}
+
+/// A finished run.
+#[derive(Debug, Clone, Default)]
+pub struct RunResult {
+    /// Labels of the jobs that ran, sorted.
+    pub ran: Vec<String>,
+    /// Number of jobs whose result was in the store.
+    pub hits: usize,
+    /// Labels and reasons of failed jobs.
+    pub failed: BTreeMap<String, String>,
+    /// Key of each job that has a result, by label.
+    pub keys: BTreeMap<String, ContentHash>,
+}
+
+#[derive(Clone)]
+struct Slot {
+    state: State,
+    key: Option<ContentHash>,
+    output: Option<ContentHash>,
+    value: Option<Arc<dyn Any + Send + Sync>>,
+    /// Users that have not finished; the value is dropped from memory after the last.
+    users_left: usize,
+    dependencies_left: usize,
+}
+
+struct Shared {
+    slots: Vec<Slot>,
+    ready: BTreeSet<JobId>,
+    in_flight: usize,
+    memory_in_flight: u64,
+    fatal: Option<anyhow::Error>,
+}
+
+/// A graph being run.
+pub struct Executor<'a> {
+    pub(super) graph: &'a JobGraph<'a>,
+    options: &'a RunOptions<'a>,
+    shared: Mutex<Shared>,
+    begun: Instant,
+    /// Jobs running now, and jobs started ever: to know whether a job ran alone.
+    running: AtomicUsize,
+    started: AtomicUsize,
+}
+
+impl<'a> Executor<'a> {
+    /// Prepares a run.
+    pub fn new(graph: &'a JobGraph<'a>, options: &'a RunOptions<'a>) -> Self {
+        let slots: Vec<Slot> = graph
+            .graph
+            .node_indices()
+            .map(|id| Slot {
+                state: State::Waiting,
+                key: None,
+                output: None,
+                value: None,
+                users_left: graph.users(id).count(),
+                dependencies_left: graph.uses(id).count(),
+            })
+            .collect();
+        let ready =
+            graph.graph.node_indices().filter(|id| slots[id.index()].dependencies_left == 0).collect();
+        let shared = Shared { slots, ready, in_flight: 0, memory_in_flight: 0, fatal: None };
+        Self {
+            graph,
+            options,
+            shared: Mutex::new(shared),
+            begun: Instant::now(),
+            running: AtomicUsize::new(0),
+            started: AtomicUsize::new(0),
+        }
+    }
+
+    /// Runs all jobs.
+    ///
+    /// # Errors
+    /// When stopped, or when the store cannot be written. A failing job is no error: see [`RunResult::failed`].
+    pub fn run(&self) -> Result<RunResult> {
+        let mut jobs = BTreeMap::new();
+        for id in self.graph.graph.node_indices() {
+            *jobs.entry(self.graph.job(id).kind.to_owned()).or_insert(0) += 1;
+        }
+        self.options.observer.notice(&Event::Planned { jobs });
+        rayon::scope(|scope| self.pump(scope));
+        self.options.observer.notice(&Event::Ended);
+        let mut shared = self.lock();
+        if let Some(error) = shared.fatal.take() {
+            return Err(error);
+        }
+        if self.options.stop.load(Ordering::Relaxed) {
+            return Err(Interrupted.into());
+        }
+        let mut result = RunResult::default();
+        for id in self.graph.graph.node_indices() {
+            let (slot, label) = (&shared.slots[id.index()], self.graph.job(id).label());
+            match &slot.state {
+                State::Hit => result.hits += 1,
+                State::Ran => result.ran.push(label.clone()),
+                State::Failed(reason) => drop(result.failed.insert(label.clone(), reason.clone())),
+                State::Waiting | State::Skipped => {}
+            }
+            if let (Some(key), Some(_)) = (slot.key, slot.output) {
+                result.keys.insert(label, key);
+            }
+        }
+        result.ran.sort();
+        Ok(result)
+    }
+
+    /// Starts as many ready jobs as threads and memory allow, in the order they were added.
+    fn pump<'s>(&'s self, scope: &rayon::Scope<'s>) {
+        loop {
+            let mut shared = self.lock();
+            let stopped = self.options.stop.load(Ordering::Relaxed) || shared.fatal.is_some();
+            if stopped || shared.in_flight >= self.options.threads.max(1) {
+                return;
+            }
+            let fits = |id: &JobId| {
+                shared.in_flight == 0
+                    || shared.memory_in_flight + self.graph.job(*id).memory <= self.options.memory
+            };
+            let Some(id) = shared.ready.iter().copied().find(fits) else { return };
+            shared.ready.remove(&id);
+            shared.in_flight += 1;
+            shared.memory_in_flight += self.graph.job(id).memory;
+            drop(shared);
+            scope.spawn(move |scope| {
+                self.settle(id);
+                self.pump(scope);
+            });
+        }
+    }
+
+    /// Decides one job and frees those that waited for it.
+    fn settle(&self, id: JobId) {
+        let job = self.graph.job(id);
+        let lacking = self.graph.uses(id).any(|(used, edge)| edge.required && self.output(used).is_none());
+        let (state, key, output) = if lacking {
+            self.options.observer.notice(&Event::Skipped { kind: job.kind, job: job.name.clone() });
+            (State::Skipped, None, None)
+        } else {
+            self.decide(id)
+        };
+        let mut shared = self.lock();
+        shared.in_flight -= 1;
+        shared.memory_in_flight -= job.memory;
+        let slot = &mut shared.slots[id.index()];
+        (slot.state, slot.key, slot.output) = (state, key, output);
+        for used in self.graph.uses(id).map(|(used, _)| used) {
+            let slot = &mut shared.slots[used.index()];
+            slot.users_left -= 1;
+            if slot.users_left == 0 {
+                slot.value = None;
+            }
+        }
+        for user in self.graph.users(id) {
+            let slot = &mut shared.slots[user.index()];
+            slot.dependencies_left -= 1;
+            if slot.dependencies_left == 0 {
+                shared.ready.insert(user);
+            }
+        }
+    }
+
+    /// Takes the result from the store or runs the job.
+    fn decide(&self, id: JobId) -> (State, Option<ContentHash>, Option<ContentHash>) {
+        let job = self.graph.job(id);
+        let fingerprint = self.fingerprint(id);
+        let key = fingerprint.key();
+        if let Some(record) = self.options.store.lookup(key) {
+            self.options.observer.notice(&Event::Hit { kind: job.kind, job: job.name.clone() });
+            return (State::Hit, Some(key), Some(record.output));
+        }
+        match self.execute(id, &fingerprint) {
+            Ok(output) => (State::Ran, Some(key), Some(output)),
+            Err(error) => {
+                let reason = format!("{error:#}");
+                self.options.observer.notice(&Event::Failed {
+                    kind: job.kind,
+                    job: job.name.clone(),
+                    reason: reason.clone(),
+                });
+                (State::Failed(reason), Some(key), None)
+            }
+        }
+    }
+
+    /// What the job's result depends on; all its inputs must be decided.
+    fn fingerprint(&self, id: JobId) -> Fingerprint {
+        let job = self.graph.job(id);
+        let mut inputs = job.external.clone();
+        for (used, edge) in self.graph.uses(id) {
+            if let Some(output) = self.output(used) {
+                inputs.insert(edge.role.clone(), output);
+            }
+        }
+        Fingerprint { kind: job.kind.to_owned(), version: job.version, params: job.params.clone(), inputs }
+    }
+
+    /// Runs the job's work and stores its result.
+    fn execute(&self, id: JobId, fingerprint: &Fingerprint) -> Result<ContentHash> {
+        let job = self.graph.job(id);
+        self.options.observer.notice(&Event::Started { kind: job.kind, job: job.name.clone() });
+        let alone = self.running.fetch_add(1, Ordering::SeqCst) == 0;
+        let ticket = self.started.fetch_add(1, Ordering::SeqCst);
+        let (thread, process, wall) = (clock::thread_cpu_secs(), clock::process_cpu_secs(), Instant::now());
+        let started_secs = self.begun.elapsed().as_secs_f64();
+        let inputs = Inputs { executor: self, id };
+        let product = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| (job.work)(&inputs)))
+            .unwrap_or_else(|_| Err(anyhow::anyhow!("the job panicked: this is a bug")));
+        // A job that ran alone may have used all cores: the process's time is its own.
+        let alone = alone && self.started.load(Ordering::SeqCst) == ticket + 1;
+        let cpu_secs =
+            if alone { clock::process_cpu_secs() - process } else { clock::thread_cpu_secs() - thread };
+        self.running.fetch_sub(1, Ordering::SeqCst);
+        let product = product?;
+        let output = match self.options.store.write(fingerprint, &product.file, cpu_secs) {
+            Ok(output) => output,
+            Err(error) => {
+                let reason = format!("cannot keep the result of {}", job.label());
+                let reported = anyhow::anyhow!("{error:#}");
+                self.lock().fatal.get_or_insert(error);
+                return Err(reported.context(reason));
+            }
+        };
+        let wall_secs = wall.elapsed().as_secs_f64();
+        let bytes = product.file.len() as u64;
+        let slot = &mut self.lock().slots[id.index()];
+        if slot.users_left > 0 {
+            slot.value = Some(product.value);
+        }
+        let job = job.name.clone();
+        let kind = self.graph.job(id).kind;
+        self.options.observer.notice(&Event::Finished {
+            kind,
+            job,
+            started_secs,
+            wall_secs,
+            cpu_secs,
+            bytes,
+        });
+        Ok(output)
+    }
+
+    /// Hash of a job's result, `None` when it has none.
+    pub fn output(&self, id: JobId) -> Option<ContentHash> {
+        self.lock().slots[id.index()].output
+    }
+
+    /// What became of a job.
+    pub fn state(&self, id: JobId) -> State {
+        self.lock().slots[id.index()].state.clone()
+    }
+
+    /// A job's result; a damaged file in the store is made again with a warning.
+    ///
+    /// # Errors
+    /// When there is none, or it can neither be read nor made again.
+    pub fn load<T: Artifact>(&self, id: JobId) -> Result<Arc<T>> {
+        let label = self.graph.job(id).label();
+        let (value, output) = {
+            let shared = self.lock();
+            (shared.slots[id.index()].value.clone(), shared.slots[id.index()].output)
+        };
+        let value = if let Some(value) = value {
+            value
+        } else {
+            let output = output.with_context(|| format!("{label} has no result"))?;
+            match self.options.store.read(output).and_then(|file| Ok(codec::decode::<T>(&file)?)) {
+                Ok(value) => self.keep(id, Arc::new(value)),
+                Err(error) => self.remake(id, output, &error)?,
+            }
+        };
+        value.downcast::<T>().map_err(|_| anyhow::anyhow!("the result of {label} is no {}", T::KIND))
+    }
+
+    fn keep(&self, id: JobId, value: Arc<dyn Any + Send + Sync>) -> Arc<dyn Any + Send + Sync> {
+        let slot = &mut self.lock().slots[id.index()];
+        if slot.users_left > 0 {
+            slot.value = Some(Arc::clone(&value));
+        }
+        value
+    }
+
+    /// Makes a result again whose file cannot be used.
+    fn remake(
+        &self,
+        id: JobId,
+        output: ContentHash,
+        error: &anyhow::Error,
+    ) -> Result<Arc<dyn Any + Send + Sync>> {
+        let label = self.graph.job(id).label();
+        let text = format!("the stored result of {label} cannot be used and is made again: {error:#}");
+        self.options.observer.notice(&Event::Warning { text });
+        self.options.store.discard(output);
+        let product: Product = (self.graph.job(id).work)(&Inputs { executor: self, id })?;
+        let again = self.options.store.write(&self.fingerprint(id), &product.file, 0.0)?;
+        anyhow::ensure!(again == output, "{label} gives another result than before: run the command again");
+        let slot = &mut self.lock().slots[id.index()];
+        slot.state = State::Ran;
+        drop(slot.value.replace(Arc::clone(&product.value)));
+        Ok(product.value)
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Shared> {
+        // A panicking job never holds the lock while it changes anything by halves.
+        self.shared.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

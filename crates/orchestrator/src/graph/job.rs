@@ -1,0 +1,161 @@
+//! Jobs and the graph they form.
+
+use std::any::Any;
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use petgraph::Direction;
+use petgraph::graph::{DiGraph, NodeIndex};
+use petgraph::visit::EdgeRef;
+use serde_json::Value;
+
+use super::executor::Executor;
+use crate::codec::{self, Artifact};
+use crate::fingerprint::ContentHash;
+
+/// A job of a [`JobGraph`].
+pub type JobId = NodeIndex;
+
+/// A result: the value and its file.
+pub struct Product {
+    pub(super) value: Arc<dyn Any + Send + Sync>,
+    pub(super) file: Vec<u8>,
+}
+
+impl Product {
+    /// A job's result.
+    ///
+    /// # Errors
+    /// When it cannot be encoded.
+    pub fn new<T: Artifact>(value: T) -> Result<Self> {
+        let file = codec::encode(&value)?;
+        Ok(Self { value: Arc::new(value), file })
+    }
+}
+
+type Work<'a> = Box<dyn Fn(&Inputs<'_, '_>) -> Result<Product> + Send + Sync + 'a>;
+
+/// One unit of work whose result is a function of its parameters and inputs.
+pub struct Job<'a> {
+    /// Kind, also the stage it counts for.
+    pub kind: &'static str,
+    /// Version of the code behind the kind.
+    pub version: u32,
+    /// Name for people, unique in a graph within its kind.
+    pub name: String,
+    /// Own parameters.
+    pub params: Value,
+    /// Contents from outside the graph, by role.
+    pub external: BTreeMap<String, ContentHash>,
+    /// Estimated working memory in bytes.
+    pub memory: u64,
+    /// The work.
+    pub work: Work<'a>,
+}
+
+impl Job<'_> {
+    /// Kind and name.
+    pub fn label(&self) -> String {
+        format!("{} {}", self.kind, self.name)
+    }
+}
+
+/// How a job uses the result of another.
+#[derive(Debug, Clone)]
+pub(super) struct Use {
+    pub role: String,
+    /// Whether the user fails with the used job; otherwise it does without.
+    pub required: bool,
+}
+
+/// A directed acyclic graph of jobs; edges lead from a job to those that use its result.
+#[derive(Default)]
+pub struct JobGraph<'a> {
+    pub(super) graph: DiGraph<Job<'a>, Use>,
+}
+
+impl<'a> JobGraph<'a> {
+    /// Adds a job; it must be added after the jobs that it uses.
+    pub fn add(&mut self, job: Job<'a>) -> JobId {
+        self.graph.add_node(job)
+    }
+
+    /// Lets `user` use the result of `used`; without it, `user` is left out.
+    pub fn require(&mut self, user: JobId, role: impl Into<String>, used: JobId) {
+        self.graph.add_edge(used, user, Use { role: role.into(), required: true });
+    }
+
+    /// Lets `user` use the result of `used` when there is one.
+    pub fn accept(&mut self, user: JobId, role: impl Into<String>, used: JobId) {
+        self.graph.add_edge(used, user, Use { role: role.into(), required: false });
+    }
+
+    /// A job.
+    pub fn job(&self, id: JobId) -> &Job<'a> {
+        &self.graph[id]
+    }
+
+    /// Number of jobs.
+    pub fn len(&self) -> usize {
+        self.graph.node_count()
+    }
+
+    /// Whether there is no job.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The graph in Graphviz' language.
+    pub fn to_dot(&self) -> String {
+        // Writing to a string cannot fail.
+        let mut dot = String::from("digraph setloc {\n  rankdir=LR;\n");
+        for id in self.graph.node_indices() {
+            let _ = writeln!(dot, "  {} [label={:?}];", id.index(), self.graph[id].label());
+        }
+        for edge in self.graph.edge_references() {
+            let (from, to) = (edge.source().index(), edge.target().index());
+            let _ = writeln!(dot, "  {from} -> {to} [label={:?}];", edge.weight().role);
+        }
+        dot + "}\n"
+    }
+
+    pub(super) fn uses(&self, id: JobId) -> impl Iterator<Item = (JobId, &Use)> {
+        self.graph.edges_directed(id, Direction::Incoming).map(|edge| (edge.source(), edge.weight()))
+    }
+
+    pub(super) fn users(&self, id: JobId) -> impl Iterator<Item = JobId> {
+        self.graph.neighbors_directed(id, Direction::Outgoing)
+    }
+}
+
+/// The results a job may use.
+pub struct Inputs<'e, 'a> {
+    pub(super) executor: &'e Executor<'a>,
+    pub(super) id: JobId,
+}
+
+impl Inputs<'_, '_> {
+    /// The result in a role.
+    ///
+    /// # Errors
+    /// When there is none, or it can neither be read nor made again.
+    pub fn get<T: Artifact>(&self, role: &str) -> Result<Arc<T>> {
+        self.find(role)?
+            .with_context(|| format!("{} has no input {role}", self.executor.graph.job(self.id).label()))
+    }
+
+    /// The result in a role, or `None` when the job that makes it failed.
+    ///
+    /// # Errors
+    /// When it can neither be read nor made again.
+    pub fn find<T: Artifact>(&self, role: &str) -> Result<Option<Arc<T>>> {
+        let used =
+            self.executor.graph.uses(self.id).find(|(_, edge)| edge.role == role).map(|(used, _)| used);
+        match used {
+            Some(used) if self.executor.output(used).is_some() => self.executor.load(used).map(Some),
+            _ => Ok(None),
+        }
+    }
+}

@@ -1,0 +1,18 @@
+//! The job kinds and how they depend on each other.
+
+mod locate;
+mod model;
+mod pairs;
+mod scene;
+
+pub use locate::{LocateJobs, SetJobs, add_set, add_single};
+pub use model::{ModelJobs, ModelKind, add_features_of, add_model};
+pub use pairs::choose_pairs;
+pub use scene::{SceneJobs, add_scene};
+
+use crate::fingerprint::ContentHash;
+
+/// A seed of its own for each use, the same whatever else is in the run.
+fn derived_seed(seed: u64, parts: &[&str]) -> u64 {
+    ContentHash::of(format!("{seed}/{}", parts.join("/")).as_bytes()).seed()
+}

@@ -1,0 +1,127 @@
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use anyhow::Result;
+use serde_json::json;
+use setloc_camset::{QueryPhoto, Scene, SetLocalization, locate_set, locate_single};
+use setloc_features::ImageFeatures;
+use setloc_sfm::{MapperOutput, Reconstruction};
+
+use super::derived_seed;
+use super::model::{ModelJobs, ModelKind, add_model};
+use crate::config::Config;
+use crate::dataset::SourceImage;
+use crate::fingerprint::ContentHash;
+use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
+use crate::scene::SceneFile;
+use crate::stages;
+
+/// What photos are located in.
+#[derive(Debug, Clone)]
+pub struct LocateJobs {
+    /// The scene.
+    pub scene: Arc<SceneFile>,
+    /// Its content hash.
+    pub scene_hash: ContentHash,
+    /// Parameters.
+    pub config: Config,
+    /// Seed of everything random.
+    pub seed: u64,
+}
+
+/// The jobs of one set.
+#[derive(Debug, Clone)]
+pub struct SetJobs {
+    /// Features and local model.
+    pub model: ModelJobs,
+    /// The set's localization.
+    pub set: JobId,
+}
+
+/// Adds features, matches, local model and localization of a set.
+///
+/// # Errors
+/// When parameters have no JSON form.
+pub fn add_set(
+    graph: &mut JobGraph<'_>,
+    name: &str,
+    photos: &[SourceImage],
+    what: &LocateJobs,
+) -> Result<SetJobs> {
+    let positions = vec![None; photos.len()];
+    let model = add_model(graph, ModelKind::Local, name, photos, &positions, &what.config, what.seed)?;
+    let listed: Vec<_> = photos.iter().map(|p| json!([p.name, p.camera, p.camera_fixed])).collect();
+    let params = json!({ "camset": what.config.camset, "seed": what.seed, "photos": listed });
+    let (owned, what_here) = (photos.to_vec(), what.clone());
+    let work = move |inputs: &Inputs<'_, '_>| run_set(inputs, &owned, &what_here);
+    let set = graph.add(Job {
+        kind: "camset",
+        version: stages::CAMSET_VERSION,
+        name: name.to_owned(),
+        params,
+        external: BTreeMap::from([("scene".to_owned(), what.scene_hash)]),
+        memory: 64 << 20,
+        work: Box::new(work),
+    });
+    graph.require(set, "local_model", model.model);
+    for (at, features) in model.features.iter().enumerate() {
+        graph.accept(set, format!("features {at:04}"), *features);
+    }
+    Ok(SetJobs { model, set })
+}
+
+fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -> Result<Product> {
+    let model = inputs.get::<MapperOutput>("local_model")?;
+    let mut features = Vec::new();
+    for (at, photo) in photos.iter().enumerate() {
+        // The local model has the same images in the same order: those whose features exist.
+        if let Some(found) = inputs.find::<ImageFeatures>(&format!("features {at:04}"))? {
+            features.push((photo, found));
+        }
+    }
+    let queries: Vec<QueryPhoto<'_>> =
+        features.iter().map(|(photo, features)| query(photo, features)).collect();
+    let empty = Reconstruction::default();
+    let scene = scene_of(&what.scene, &empty);
+    let seed = derived_seed(what.seed, &["camset"]);
+    let located: SetLocalization = locate_set(&what.config.camset, &scene, &queries, &model.components, seed);
+    Product::new(located)
+}
+
+/// Adds the localization of one photo alone, from its features.
+pub fn add_single(
+    graph: &mut JobGraph<'_>,
+    photo: &SourceImage,
+    features: JobId,
+    what: &LocateJobs,
+) -> JobId {
+    let camera = json!([photo.name, photo.camera, photo.camera_fixed]);
+    let params = json!({ "single": what.config.single, "seed": what.seed, "photo": camera });
+    let (owned, what_here) = (photo.clone(), what.clone());
+    let work = move |inputs: &Inputs<'_, '_>| {
+        let features = inputs.get::<ImageFeatures>("features")?;
+        let empty = Reconstruction::default();
+        let scene = scene_of(&what_here.scene, &empty);
+        let seed = derived_seed(what_here.seed, &["single", &owned.hash.to_string()]);
+        Product::new(locate_single(&what_here.config.single, &scene, &query(&owned, &features), seed))
+    };
+    let single = graph.add(Job {
+        kind: "single",
+        version: stages::SINGLE_VERSION,
+        name: photo.name.clone(),
+        params,
+        external: BTreeMap::from([("scene".to_owned(), what.scene_hash)]),
+        memory: 32 << 20,
+        work: Box::new(work),
+    });
+    graph.require(single, "features", features);
+    single
+}
+
+fn query<'a>(photo: &'a SourceImage, features: &'a ImageFeatures) -> QueryPhoto<'a> {
+    QueryPhoto { name: &photo.name, camera: &photo.camera, camera_fixed: photo.camera_fixed, features }
+}
+
+fn scene_of<'a>(scene: &'a SceneFile, empty: &'a Reconstruction) -> Scene<'a> {
+    Scene { reconstruction: scene.main().unwrap_or(empty), index: &scene.index }
+}

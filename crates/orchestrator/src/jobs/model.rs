@@ -1,0 +1,299 @@
+//! Features, matches, verification and mapping of a list of images: for scenes and for local models.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use nalgebra::Vector3;
+use serde_json::json;
+use setloc_features::{Camera, ImageFeatures, Match};
+use setloc_sfm::{
+    CameraId, ImageId, InputImage, MapperInput, PairGeometry, TwoView, reconstruct, verify_pair,
+};
+
+use super::{choose_pairs, derived_seed};
+use crate::artifacts::{PairMatches, VerifiedPair};
+use crate::config::Config;
+use crate::dataset::SourceImage;
+use crate::fingerprint::ContentHash;
+use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
+use crate::stages;
+
+/// What the model is for; the name of its job kind.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ModelKind {
+    /// A scene.
+    Scene,
+    /// A set's local model.
+    Local,
+}
+
+/// The jobs of one model.
+#[derive(Debug, Clone)]
+pub struct ModelJobs {
+    /// One job an image.
+    pub features: Vec<JobId>,
+    /// The mapping job.
+    pub model: JobId,
+}
+
+/// Adds all jobs from image files to a model.
+///
+/// # Errors
+/// When parameters have no JSON form.
+pub fn add_model(
+    graph: &mut JobGraph<'_>,
+    kind: ModelKind,
+    name: &str,
+    images: &[SourceImage],
+    positions: &[Option<Vector3<f64>>],
+    config: &Config,
+    seed: u64,
+) -> Result<ModelJobs> {
+    let features = add_features_of(graph, images, config);
+    let mut pairs = Vec::new();
+    for (a, b) in choose_pairs(&config.pairs, positions) {
+        pairs.push((a, b, add_pair(graph, images, &features, (a, b), config, seed)?));
+    }
+    let cameras = share_cameras(images);
+    let placed: Vec<_> =
+        cameras.of_image.iter().zip(positions).map(|(camera, position)| json!([camera, position])).collect();
+    let params = json!({
+        "sfm": config.sfm, "seed": seed, "images": placed, "cameras": cameras.cameras, "camera_fixed": cameras.fixed,
+    });
+    let mapper = config.sfm.clone();
+    let positions = positions.to_vec();
+    let pair_list: Vec<(usize, usize, bool)> =
+        pairs.iter().map(|&(a, b, _)| (a, b, is_swapped(images, a, b))).collect();
+    let work = move |inputs: &Inputs<'_, '_>| {
+        let input = ModelInput { cameras: &cameras, positions: &positions, pairs: &pair_list };
+        run_model(inputs, &mapper, &input, seed)
+    };
+    let model = graph.add(Job {
+        kind: if kind == ModelKind::Scene { "model" } else { "local_model" },
+        version: stages::MAPPER_VERSION,
+        name: name.to_owned(),
+        params,
+        external: BTreeMap::new(),
+        memory: 64 << 20,
+        work: Box::new(work),
+    });
+    for (at, used) in features.iter().enumerate() {
+        graph.accept(model, features_role(at), *used);
+    }
+    for (a, b, used) in pairs {
+        graph.accept(model, pair_role(a, b), used);
+    }
+    Ok(ModelJobs { features, model })
+}
+
+/// Adds decoding and extraction of each image.
+pub fn add_features_of(graph: &mut JobGraph<'_>, images: &[SourceImage], config: &Config) -> Vec<JobId> {
+    images.iter().map(|image| add_features(graph, image, config)).collect()
+}
+
+fn features_role(at: usize) -> String {
+    format!("features {at:04}")
+}
+
+fn pair_role(a: usize, b: usize) -> String {
+    format!("pair {a:04} {b:04}")
+}
+
+/// Pair jobs go by content, not by order of names, so that renaming an image changes nothing.
+fn is_swapped(images: &[SourceImage], a: usize, b: usize) -> bool {
+    images[b].hash < images[a].hash
+}
+
+fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, config: &Config) -> JobId {
+    let mut external = BTreeMap::from([("image".to_owned(), image.hash)]);
+    let mask = image.mask.clone();
+    if let Some((_, hash)) = &mask {
+        external.insert("mask".to_owned(), *hash);
+    }
+    // Decoded pixels, their grey float pyramid and the descriptors: about 24 bytes a pixel.
+    let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 24;
+    let params = json!({ "features": config.features, "camera": image.camera });
+    let (path, hash, camera, features) =
+        (image.path.clone(), image.hash, image.camera.clone(), config.features.clone());
+    let work = move |_: &Inputs<'_, '_>| {
+        let bytes = read_unchanged(&path, hash)?;
+        let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
+        let mask = mask.as_ref().map(|(path, hash)| read_mask(path, *hash)).transpose()?;
+        Product::new(stages::extract(&features, &decoded, &camera, mask.as_ref())?)
+    };
+    let (kind, version, name) = ("features", stages::FEATURES_VERSION, image.name.clone());
+    graph.add(Job { kind, version, name, params, external, memory, work: Box::new(work) })
+}
+
+fn read_mask(path: &Path, hash: ContentHash) -> Result<stages::Mask> {
+    let bytes = read_unchanged(path, hash)?;
+    stages::read_mask(&bytes).with_context(|| format!("mask {}", path.display()))
+}
+
+/// The bytes that were hashed when the run was planned.
+fn read_unchanged(path: &Path, hash: ContentHash) -> Result<Vec<u8>> {
+    let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    anyhow::ensure!(ContentHash::of(&bytes) == hash, "{} changed while it was used", path.display());
+    Ok(bytes)
+}
+
+/// Adds matching and verification of one pair; returns the verification.
+fn add_pair(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    features: &[JobId],
+    (a, b): (usize, usize),
+    config: &Config,
+    seed: u64,
+) -> Result<JobId> {
+    let name = format!("{} {}", images[a].name, images[b].name);
+    let (a, b) = if is_swapped(images, a, b) { (b, a) } else { (a, b) };
+    let matching = config.matching.clone();
+    let match_work = move |inputs: &Inputs<'_, '_>| {
+        let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
+        Product::new(PairMatches(stages::match_features(&matching, &first, &second)))
+    };
+    let matches = graph.add(Job {
+        kind: "matches",
+        version: stages::MATCHING_VERSION,
+        name: name.clone(),
+        params: serde_json::to_value(&config.matching)?,
+        external: BTreeMap::new(),
+        memory: 8 << 20,
+        work: Box::new(match_work),
+    });
+    let seed = derived_seed(seed, &[&images[a].hash.to_string(), &images[b].hash.to_string()]);
+    let (two_view, cameras) = (config.two_view.clone(), [images[a].camera.clone(), images[b].camera.clone()]);
+    let params = json!({ "two_view": two_view, "cameras": cameras, "seed": seed });
+    let verify_work = move |inputs: &Inputs<'_, '_>| {
+        let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
+        let matches = inputs.get::<PairMatches>("matches")?;
+        let (first, second) = (first.rays(&cameras[0]), second.rays(&cameras[1]));
+        Product::new(VerifiedPair(verify_pair(&two_view, &first, &second, &matches.0, seed)))
+    };
+    let verified = graph.add(Job {
+        kind: "verify",
+        version: stages::VERIFY_VERSION,
+        name,
+        params,
+        external: BTreeMap::new(),
+        memory: 8 << 20,
+        work: Box::new(verify_work),
+    });
+    for job in [matches, verified] {
+        graph.require(job, "first", features[a]);
+        graph.require(job, "second", features[b]);
+    }
+    graph.require(verified, "matches", matches);
+    Ok(verified)
+}
+
+/// Cameras shared by the images that have the same one.
+struct SharedCameras {
+    cameras: Vec<Camera>,
+    fixed: Vec<bool>,
+    of_image: Vec<usize>,
+}
+
+fn share_cameras(images: &[SourceImage]) -> SharedCameras {
+    let mut shared = SharedCameras { cameras: Vec::new(), fixed: Vec::new(), of_image: Vec::new() };
+    for image in images {
+        let same =
+            |at: &usize| shared.cameras[*at] == image.camera && shared.fixed[*at] == image.camera_fixed;
+        let at = (0..shared.cameras.len()).find(same).unwrap_or_else(|| {
+            shared.cameras.push(image.camera.clone());
+            shared.fixed.push(image.camera_fixed);
+            shared.cameras.len() - 1
+        });
+        shared.of_image.push(at);
+    }
+    shared
+}
+
+struct ModelInput<'a> {
+    cameras: &'a SharedCameras,
+    positions: &'a [Option<Vector3<f64>>],
+    pairs: &'a [(usize, usize, bool)],
+}
+
+fn run_model(
+    inputs: &Inputs<'_, '_>,
+    params: &setloc_sfm::MapperParams,
+    input: &ModelInput<'_>,
+    seed: u64,
+) -> Result<Product> {
+    let mut features: Vec<(usize, Arc<ImageFeatures>)> = Vec::new();
+    let mut id_of = BTreeMap::new();
+    for at in 0..input.positions.len() {
+        if let Some(found) = inputs.find::<ImageFeatures>(&features_role(at))? {
+            id_of.insert(at, ImageId(features.len() as u32));
+            features.push((at, found));
+        }
+    }
+    let mut pairs = Vec::new();
+    for &(a, b, swapped) in input.pairs {
+        let verified = inputs.find::<VerifiedPair>(&pair_role(a, b))?;
+        let two_view = verified.as_deref().and_then(|verified| verified.0.as_ref());
+        if let (Some(two_view), Some(&first), Some(&second)) = (two_view, id_of.get(&a), id_of.get(&b)) {
+            let two_view = if swapped { flip(two_view) } else { two_view.clone() };
+            pairs.push(PairGeometry { first, second, two_view });
+        }
+    }
+    let names: Vec<String> = features.iter().map(|(at, _)| place_holder(*at)).collect();
+    let images = features.iter().zip(&names).map(|((at, features), name)| InputImage {
+        name,
+        camera: CameraId(input.cameras.of_image[*at] as u32),
+        features,
+        position_prior: input.positions[*at],
+    });
+    let images = images.collect();
+    let (cameras, camera_fixed) = (input.cameras.cameras.clone(), input.cameras.fixed.clone());
+    Product::new(reconstruct(params, &MapperInput { cameras, camera_fixed, images, pairs: &pairs }, seed))
+}
+
+/// Stands for an image's name inside models, so that a renamed image leaves them as they are.
+fn place_holder(at: usize) -> String {
+    format!("⟦{at}⟧")
+}
+
+/// The image that a place holder stands for.
+pub(super) fn image_of_place_holder(text: &str) -> Option<usize> {
+    text.strip_prefix('⟦')?.strip_suffix('⟧')?.parse().ok()
+}
+
+/// Puts names where place holders stand.
+pub(super) fn with_names(text: &str, names: &[String]) -> String {
+    let mut parts = text.split('⟦');
+    let mut out = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let named =
+            part.split_once('⟧').and_then(|(at, rest)| Some((names.get(at.parse::<usize>().ok()?)?, rest)));
+        match named {
+            Some((name, rest)) => out.extend([name, rest]),
+            None => out.extend(["⟦", part]),
+        }
+    }
+    out
+}
+
+/// The same geometry with the two images exchanged.
+fn flip(two_view: &TwoView) -> TwoView {
+    let mut inliers: Vec<Match> =
+        two_view.inliers.iter().map(|m| Match { first: m.second, second: m.first }).collect();
+    inliers.sort_unstable();
+    TwoView { second_from_first: two_view.second_from_first.inverse(), inliers, ..two_view.clone() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn place_holders_become_names() {
+        let names = ["a.jpg".to_owned(), "b.jpg".to_owned()];
+        assert_eq!(with_names("⟦1⟧ and ⟦0⟧ but not ⟦7⟧ nor ⟦", &names), "b.jpg and a.jpg but not ⟦7⟧ nor ⟦");
+        assert_eq!(image_of_place_holder(&place_holder(12)), Some(12));
+    }
+}

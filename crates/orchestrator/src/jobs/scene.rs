@@ -1,0 +1,108 @@
+use std::collections::BTreeMap;
+
+use anyhow::Result;
+use nalgebra::Vector3;
+use serde_json::json;
+use setloc_features::ImageFeatures;
+use setloc_index::SceneIndex;
+use setloc_sfm::{MapperOutput, Reconstruction};
+
+use super::model::{ModelJobs, ModelKind, add_model, image_of_place_holder, with_names};
+use crate::config::Config;
+use crate::dataset::SourceImage;
+use crate::geodesy::Wgs84;
+use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
+use crate::scene::SceneFile;
+use crate::stages;
+
+/// The jobs of a scene.
+#[derive(Debug, Clone)]
+pub struct SceneJobs {
+    /// Features and model.
+    pub model: ModelJobs,
+    /// The scene file.
+    pub scene: JobId,
+}
+
+/// Adds all jobs from image files to a scene file.
+///
+/// # Errors
+/// When parameters have no JSON form.
+pub fn add_scene(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    config: &Config,
+    seed: u64,
+) -> Result<SceneJobs> {
+    let origin = origin_of(images);
+    let positions: Vec<Option<Vector3<f64>>> =
+        images.iter().map(|image| Some(image.position?.to_enu(origin?))).collect();
+    let jobs = add_model(graph, ModelKind::Scene, "scene", images, &positions, config, seed)?;
+    let index_params = config.index.clone();
+    let index_work = move |inputs: &Inputs<'_, '_>| {
+        let output = inputs.get::<MapperOutput>("model")?;
+        let Some(model) = output.components.first() else { return Product::new(SceneIndex::default()) };
+        let mut features = Vec::new();
+        for image in &model.images {
+            let at = image_of_place_holder(&image.name).unwrap_or_default();
+            features.push(inputs.get::<ImageFeatures>(&format!("features {at:04}"))?);
+        }
+        let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
+        Product::new(SceneIndex::build(&index_params, model, &features))
+    };
+    let index = graph.add(Job {
+        kind: "index",
+        version: stages::INDEX_VERSION,
+        name: "scene".to_owned(),
+        params: serde_json::to_value(&config.index)?,
+        external: BTreeMap::new(),
+        memory: 64 << 20,
+        work: Box::new(index_work),
+    });
+    graph.require(index, "model", jobs.model);
+    for (at, features) in jobs.features.iter().enumerate() {
+        graph.accept(index, format!("features {at:04}"), *features);
+    }
+    let names: Vec<String> = images.iter().map(|image| image.name.clone()).collect();
+    let config = config.to_toml()?;
+    let params = json!({ "names": names, "origin": origin, "config": config });
+    let scene_work = move |inputs: &Inputs<'_, '_>| {
+        let output = inputs.get::<MapperOutput>("model")?;
+        let index = inputs.get::<SceneIndex>("index")?;
+        Product::new(SceneFile {
+            components: output.components.iter().map(|model| named(model, &names)).collect(),
+            index: (*index).clone(),
+            origin,
+            warnings: output.report.warnings.iter().map(|text| with_names(text, &names)).collect(),
+            config: config.clone(),
+        })
+    };
+    let scene = graph.add(Job {
+        kind: "scene",
+        version: 1,
+        name: "scene".to_owned(),
+        params,
+        external: BTreeMap::new(),
+        memory: 64 << 20,
+        work: Box::new(scene_work),
+    });
+    graph.require(scene, "model", jobs.model);
+    graph.require(scene, "index", index);
+    Ok(SceneJobs { model: jobs, scene })
+}
+
+/// The model with the images' names in place of the place holders.
+fn named(model: &Reconstruction, names: &[String]) -> Reconstruction {
+    let mut model = model.clone();
+    for image in &mut model.images {
+        image.name = with_names(&image.name, names);
+    }
+    model
+}
+
+/// The mean of the measured positions.
+fn origin_of(images: &[SourceImage]) -> Option<Wgs84> {
+    let places: Vec<Wgs84> = images.iter().filter_map(|image| image.position).collect();
+    let mean = |value: fn(&Wgs84) -> f64| places.iter().map(value).sum::<f64>() / places.len() as f64;
+    (!places.is_empty()).then(|| Wgs84 { lat: mean(|p| p.lat), lon: mean(|p| p.lon), alt: mean(|p| p.alt) })
+}

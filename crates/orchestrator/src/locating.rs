@@ -1,0 +1,134 @@
+//! Locates photos in a scene: alone, as a set, or as a set when alone fails.
+
+use std::collections::BTreeMap;
+
+use anyhow::Result;
+use setloc_camset::{PhotoLocalization, SetLocalization, Verdict};
+use setloc_sfm::MapperOutput;
+
+use crate::dataset::{ImageFolder, SkippedImage};
+use crate::fingerprint::ContentHash;
+use crate::graph::JobGraph;
+use crate::jobs::{LocateJobs, add_features_of, add_set, add_single};
+use crate::session::Session;
+
+/// Which methods are tried.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+pub enum Mode {
+    /// Each photo alone; the set when the target is not localized so.
+    #[default]
+    Auto,
+    /// Each photo alone.
+    Single,
+    /// The set only.
+    Set,
+    /// Both, whatever comes out.
+    #[value(skip)]
+    Both,
+}
+
+/// What came out.
+#[derive(Debug, Clone, Default)]
+pub struct Located {
+    /// Each photo alone; empty when not tried.
+    pub single: Vec<PhotoLocalization>,
+    /// The set, when it was tried.
+    pub set: Option<SetLocalization>,
+    /// Size of the set's local models: registered photos of each component.
+    pub local_models: Vec<usize>,
+    /// Photos that could not be used, and why.
+    pub skipped: Vec<SkippedImage>,
+}
+
+impl Located {
+    /// The best answer for each photo with the method that gave it: camset+opt, else camset, else alone.
+    pub fn answers(&self) -> Vec<(&'static str, &PhotoLocalization)> {
+        let refined = self.set.iter().flat_map(|set| set.refined.iter().map(|p| ("camset+opt", p)));
+        let rigid = self.set.iter().flat_map(|set| set.rigid.iter().map(|p| ("camset", p)));
+        let single = self.single.iter().map(|p| ("single", p));
+        let mut best: BTreeMap<&str, (&'static str, &PhotoLocalization)> = BTreeMap::new();
+        for (method, photo) in single.chain(rigid).chain(refined) {
+            let better = |old: &PhotoLocalization| rank(photo.verdict) >= rank(old.verdict);
+            if best.get(photo.name.as_str()).is_none_or(|(_, old)| better(old)) {
+                best.insert(&photo.name, (method, photo));
+            }
+        }
+        best.into_values().collect()
+    }
+}
+
+fn rank(verdict: Verdict) -> u8 {
+    match verdict {
+        Verdict::Localized => 2,
+        Verdict::Uncertain => 1,
+        Verdict::NotLocalized => 0,
+    }
+}
+
+/// Locates photos; `target` is the photo that decides in [`Mode::Auto`].
+///
+/// # Errors
+/// When the run was stopped or the store cannot be written.
+pub fn locate(
+    session: &Session,
+    folder: &ImageFolder,
+    what: &LocateJobs,
+    mode: Mode,
+    name: &str,
+    target: &str,
+) -> Result<Located> {
+    let mut located = Located { skipped: folder.skipped.clone(), ..Located::default() };
+    let mut keys = BTreeMap::new();
+    if matches!(mode, Mode::Auto | Mode::Single) {
+        keys.extend(run(session, folder, what, (true, None), &mut located)?);
+    }
+    let found =
+        located.single.iter().any(|photo| photo.name == target && photo.verdict == Verdict::Localized);
+    let wanted = matches!(mode, Mode::Set | Mode::Both) || (mode == Mode::Auto && !found);
+    if wanted && folder.images.len() > 1 {
+        keys.extend(run(session, folder, what, (mode == Mode::Both, Some(name)), &mut located)?);
+    }
+    session.remember(name, keys)?;
+    Ok(located)
+}
+
+/// Runs one graph: each photo alone, the set of this name, or both.
+fn run(
+    session: &Session,
+    folder: &ImageFolder,
+    what: &LocateJobs,
+    (alone, set_name): (bool, Option<&str>),
+    located: &mut Located,
+) -> Result<BTreeMap<String, ContentHash>> {
+    let mut graph = JobGraph::default();
+    let set = set_name.map(|name| add_set(&mut graph, name, &folder.images, what)).transpose()?;
+    let features = match &set {
+        Some(set) => set.model.features.clone(),
+        None => add_features_of(&mut graph, &folder.images, &what.config),
+    };
+    let mut single = Vec::new();
+    if alone {
+        single.extend(
+            folder.images.iter().zip(&features).map(|(photo, job)| add_single(&mut graph, photo, *job, what)),
+        );
+    }
+    session.run(&graph, |executor, result| {
+        for (photo, job) in folder.images.iter().zip(&features) {
+            let known = located.skipped.iter().any(|skipped| skipped.name == photo.name);
+            if let (Some(reason), false) = (result.failed.get(&graph.job(*job).label()), known) {
+                located.skipped.push(SkippedImage { name: photo.name.clone(), reason: reason.clone() });
+            }
+        }
+        for job in &single {
+            if executor.output(*job).is_some() {
+                located.single.push((*executor.load::<PhotoLocalization>(*job)?).clone());
+            }
+        }
+        if let Some(set) = set.filter(|set| executor.output(set.set).is_some()) {
+            located.set = Some((*executor.load::<SetLocalization>(set.set)?).clone());
+            let model = executor.load::<MapperOutput>(set.model.model)?;
+            located.local_models = model.components.iter().map(|c| c.registered().count()).collect();
+        }
+        Ok(result.keys.clone())
+    })
+}

@@ -1,0 +1,110 @@
+use std::collections::BTreeMap;
+use std::io::IsTerminal;
+use std::sync::{Mutex, PoisonError};
+
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+
+use crate::graph::{Event, Observer};
+use crate::print;
+
+/// Stages in the order they are shown.
+const STAGES: [&str; 9] =
+    ["features", "matches", "verify", "model", "local_model", "index", "scene", "single", "camset"];
+
+/// Bars with rate and remaining time on a terminal, plain lines elsewhere; all on standard error.
+pub struct Console {
+    terminal: bool,
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    bars: Option<MultiProgress>,
+    stages: BTreeMap<&'static str, Stage>,
+}
+
+#[derive(Default)]
+struct Stage {
+    total: usize,
+    done: usize,
+    hits: usize,
+    bar: Option<ProgressBar>,
+}
+
+impl Console {
+    /// For this process's standard error.
+    pub fn new() -> Self {
+        Self { terminal: std::io::stderr().is_terminal(), state: Mutex::default() }
+    }
+
+    fn step(&self, kind: &str, hit: bool) {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(stage) = state.stages.get_mut(kind) else { return };
+        stage.done += 1;
+        stage.hits += usize::from(hit);
+        if let Some(bar) = &stage.bar {
+            bar.set_message(if stage.hits > 0 {
+                format!("({} from cache)", stage.hits)
+            } else {
+                String::new()
+            });
+            bar.inc(1);
+        } else if stage.done == stage.total {
+            let cached = if stage.hits > 0 { format!(" ({} from cache)", stage.hits) } else { String::new() };
+            print::note(&format!("{kind}: {}/{}{cached}", stage.done, stage.total));
+        }
+    }
+
+    fn tell(&self, text: &str) {
+        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        match &state.bars {
+            Some(bars) => bars.suspend(|| print::note(text)),
+            None => print::note(text),
+        }
+    }
+}
+
+impl Default for Console {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Observer for Console {
+    fn notice(&self, event: &Event) {
+        match event {
+            Event::Planned { jobs } => {
+                let bars = self.terminal.then(MultiProgress::new);
+                let style = ProgressStyle::with_template(
+                    "{prefix:>11} {wide_bar} {pos}/{len} {per_sec} eta {eta} {msg}",
+                );
+                let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
+                let mut stages = BTreeMap::new();
+                for kind in STAGES {
+                    let Some(&total) = jobs.get(kind) else { continue };
+                    let bar = bars.as_ref().map(|bars| {
+                        let bar = bars.add(ProgressBar::new(total as u64));
+                        bar.with_style(style.clone()).with_prefix(kind)
+                    });
+                    stages.insert(kind, Stage { total, bar, ..Stage::default() });
+                }
+                *self.state.lock().unwrap_or_else(PoisonError::into_inner) = State { bars, stages };
+            }
+            Event::Hit { kind, .. } => self.step(kind, true),
+            Event::Finished { kind, .. } | Event::Skipped { kind, .. } => self.step(kind, false),
+            Event::Failed { kind, job, reason } => {
+                self.tell(&format!("warning: {kind} {job}: {reason}"));
+                self.step(kind, false);
+            }
+            Event::Warning { text } => self.tell(&format!("warning: {text}")),
+            Event::Started { .. } => {}
+            Event::Ended => {
+                let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+                for stage in state.stages.values().filter_map(|stage| stage.bar.as_ref()) {
+                    stage.finish_and_clear();
+                }
+                *state = State::default();
+            }
+        }
+    }
+}

@@ -1,0 +1,61 @@
+//! The whole path on data with truth.
+
+#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use setloc_orchestrator::bench::{BenchGps, BenchOptions, DatasetFigures, bench_dataset};
+use setloc_orchestrator::config::Config;
+use setloc_orchestrator::session::{Limits, Session};
+use setloc_orchestrator::stages;
+
+fn bench(dataset: &Path) -> DatasetFigures {
+    let store = tempfile::tempdir().unwrap();
+    let limits = Limits { threads: 2, memory: 4 << 30 };
+    let session = Session::open(store.path(), None, limits, Arc::new(AtomicBool::new(false))).unwrap();
+    let options = BenchOptions { config: Config::default(), seed: 0, gps: BenchGps::None };
+    bench_dataset(&session, dataset, &options).unwrap()
+}
+
+/// Scene whole and right; the target fails alone and is found by its set.
+fn assert_main_job(figures: &DatasetFigures) {
+    let scene = &figures.scene;
+    assert_eq!((scene.registered, scene.components), (scene.images, 1), "{scene:?}");
+    let (position, rotation) = (scene.position_m.unwrap(), scene.rotation_deg.unwrap());
+    assert!(position.median < 0.05 && rotation.median < 0.1, "{position:?} {rotation:?}");
+    for set in &figures.sets {
+        let (single, refined) = (&set.methods["single"], &set.methods["camset+opt"]);
+        assert!(
+            refined.registered * 10 >= set.images * 9,
+            "{}: {} of {}",
+            set.name,
+            refined.registered,
+            set.images
+        );
+        assert!(single.registered < refined.registered, "{}", set.name);
+        let (position, rotation) = (refined.position_m.unwrap(), refined.rotation_deg.unwrap());
+        assert!(position.median < 0.3 && rotation.median < 0.5, "{}: {position:?} {rotation:?}", set.name);
+        assert!(refined.target_registered && !single.target_registered, "{}", set.name);
+    }
+}
+
+#[test]
+fn the_town_is_mapped_and_its_set_located() {
+    let folder = tempfile::tempdir().unwrap();
+    stages::write_sample(folder.path()).unwrap();
+    let figures = bench(folder.path());
+    assert!(!figures.sets.is_empty());
+    assert_main_job(&figures);
+}
+
+#[test]
+fn the_small_rendered_street_is_mapped_and_its_set_located() {
+    let dataset = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/small");
+    if !dataset.join("truth.json").is_file() {
+        println!("skipped: {} is not present", dataset.display());
+        return;
+    }
+    assert_main_job(&bench(&dataset));
+}
