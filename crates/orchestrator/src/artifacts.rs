@@ -84,7 +84,7 @@ impl Artifact for PairMatches {
 
 /// The geometry of two images, or that there is none.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct VerifiedPair(pub Option<TwoView>);
+pub struct VerifiedPair(pub Vec<TwoView>);
 
 serde_artifact!(VerifiedPair, "verified pair", 1);
 serde_artifact!(MapperOutput, "model", 1);

@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 use setloc_camset::{CamsetParams, SingleParams};
 use setloc_index::IndexParams;
-use setloc_sfm::{MapperParams, TwoViewParams};
+use setloc_sfm::{GeoregisterParams, MapperParams, QualityParams, TwoViewParams};
 
 use crate::error::Hinted;
 use crate::stages::{FeatureParams, MatchParams};
@@ -25,6 +25,10 @@ pub struct Config {
     pub two_view: TwoViewParams,
     /// Mapping of the scene and of local models.
     pub sfm: MapperParams,
+    /// What the quality gate speaks up about.
+    pub quality: QualityParams,
+    /// Alignment to measured positions.
+    pub georegistration: GeoregisterParams,
     /// The scene's index.
     pub index: IndexParams,
     /// Localization of one photo.

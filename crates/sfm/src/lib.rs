@@ -6,14 +6,24 @@
 
 pub mod bundle;
 mod geometry;
+mod georegister;
 mod mapper;
+mod quality;
 mod reconstruction;
 pub mod robust;
 pub mod solvers;
 pub mod synthetic;
 mod two_view;
+mod visibility;
 
 pub use geometry::{Rigid, Similarity};
-pub use mapper::{InputImage, MapperInput, MapperOutput, MapperParams, MapperReport, reconstruct};
-pub use reconstruction::{CameraId, ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint};
-pub use two_view::{PairGeometry, TwoView, TwoViewKind, TwoViewParams, verify_pair};
+pub use georegister::{GeoregisterParams, Georegistration, georegister};
+pub use mapper::{
+    InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, RegistrationRecord,
+    reconstruct,
+};
+pub use quality::{PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess};
+pub use reconstruction::{
+    CameraId, ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint,
+};
+pub use two_view::{PairGeometry, TWO_VIEW_VERSION, TwoView, TwoViewKind, TwoViewParams, verify_pair};

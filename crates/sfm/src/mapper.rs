@@ -1,13 +1,101 @@
+//! The incremental mapper: from verified pairs to components.
+
+mod adjust;
+mod correspondence;
+mod initial;
+mod model;
+mod register;
+mod structure;
+
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, ImageFeatures};
 
-use crate::{CameraId, PairGeometry, Reconstruction};
+use self::{
+    adjust::{Scope, adjust},
+    correspondence::CorrespondenceGraph,
+    model::Model,
+    register::{PoseHypothesis, hypothesize, register, scene_matches, visibility},
+    structure::{PointLimits, complete_and_merge, filter, triangulate_image},
+};
+use crate::{
+    CameraId, Georegistration, ImageId, PairGeometry, Reconstruction,
+    bundle::{BundleParams, RobustLoss},
+    robust::RansacParams,
+};
 
-/// How to build a model.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+/// Bumped when equal inputs and parameters give another model.
+pub const MAPPER_VERSION: u32 = 1;
+
+/// How to build a model from verified pairs.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct MapperParams {}
+pub struct MapperParams {
+    /// Largest angular error of an observation, in standard deviations of its ray.
+    pub max_error_sigma: f64,
+    /// Smallest triangulation angle of a point, in degrees.
+    pub min_triangulation_angle_deg: f64,
+    /// Fewest points of an initial pair.
+    pub min_initial_points: usize,
+    /// Smallest median parallax of an initial pair, in degrees.
+    pub min_initial_parallax_deg: f64,
+    /// Initial pairs tried before a component is given up.
+    pub max_initial_pairs: usize,
+    /// Fewest inliers of a registration.
+    pub min_registration_inliers: usize,
+    /// Smallest share of the points in plain view that a registration must match; guards against repeated structure.
+    pub min_visibility_recall: f64,
+    /// Points that must be in plain view for the recall to count.
+    pub min_visible_points: usize,
+    /// Poses tried for one image when repeated structure offers several.
+    pub max_pose_hypotheses: usize,
+    /// Images adjusted together with a new one.
+    pub local_bundle_images: usize,
+    /// Growth of the number of images that triggers an adjustment of everything.
+    pub global_bundle_growth: f64,
+    /// Scale of the Cauchy loss in standard deviations.
+    pub loss_sigma: f64,
+}
+
+impl Default for MapperParams {
+    fn default() -> Self {
+        Self {
+            max_error_sigma: 4.0,
+            min_triangulation_angle_deg: 1.0,
+            min_initial_points: 50,
+            min_initial_parallax_deg: 3.0,
+            max_initial_pairs: 30,
+            min_registration_inliers: 15,
+            min_visibility_recall: 0.1,
+            min_visible_points: 100,
+            max_pose_hypotheses: 3,
+            local_bundle_images: 5,
+            global_bundle_growth: 1.4,
+            loss_sigma: 1.0,
+        }
+    }
+}
+
+impl MapperParams {
+    fn limits(&self) -> PointLimits {
+        PointLimits {
+            max_error_sigma: self.max_error_sigma,
+            min_angle_rad: self.min_triangulation_angle_deg.to_radians(),
+        }
+    }
+
+    fn bundle(&self, max_iterations: u32) -> BundleParams {
+        BundleParams { loss: RobustLoss::Cauchy(self.loss_sigma), max_iterations, ..BundleParams::default() }
+    }
+
+    fn ransac(&self) -> RansacParams {
+        RansacParams {
+            max_error_sigma: self.max_error_sigma * 1.5,
+            min_inliers: self.min_registration_inliers,
+            ..RansacParams::default()
+        }
+    }
+}
 
 /// One image to map.
 #[derive(Debug, Clone, Copy)]
@@ -35,9 +123,30 @@ pub struct MapperInput<'a> {
     pub pairs: &'a [PairGeometry],
 }
 
+/// How one image entered the model, or why it did not.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RegistrationRecord {
+    /// The image.
+    pub image: ImageId,
+    /// Whether the pose was accepted.
+    pub accepted: bool,
+    /// 2D-to-3D matches offered by the verified pairs.
+    pub candidates: usize,
+    /// Those that agree with the pose.
+    pub inliers: usize,
+    /// Points in plain view of the pose.
+    pub expected: usize,
+    /// Those of them that were matched.
+    pub matched: usize,
+}
+
 /// What happened, for people.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct MapperReport {
+    /// Registrations in the order tried.
+    pub registrations: Vec<RegistrationRecord>,
+    /// How the largest component lies in the measured frame, when positions were given and fix it.
+    pub georegistration: Option<Georegistration>,
     /// Things that disagree, in words.
     pub warnings: Vec<String>,
 }
@@ -51,7 +160,244 @@ pub struct MapperOutput {
     pub report: MapperReport,
 }
 
-/// Builds all components from verified pairs.
-pub fn reconstruct(_params: &MapperParams, _input: &MapperInput<'_>, _seed: u64) -> MapperOutput {
-    MapperOutput::default()
+/// Builds all components from verified pairs, largest first.
+///
+/// Images that share no geometry with others are in no component. The frame of a component is its first camera's,
+/// with the first baseline as unit of length, until it is georegistered.
+pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
+    let mut output = MapperOutput::default();
+    let mut taken = vec![false; input.images.len()];
+    while let Some(mut mapper) = Mapper::new(params, input, taken.clone(), seed) {
+        let found = mapper.initialize();
+        if found {
+            mapper.grow();
+            mapper.finish();
+        }
+        output.report.registrations.append(&mut mapper.records);
+        if !found || mapper.model.registered_count() < 2 {
+            break;
+        }
+        for image in mapper.model.registered() {
+            taken[image.index()] = true;
+        }
+        output.components.push(mapper.model.into_reconstruction());
+    }
+    output.components.sort_by_key(|component| std::cmp::Reverse(component.registered().count()));
+    output
+}
+
+struct Mapper<'a> {
+    params: &'a MapperParams,
+    model: Model<'a>,
+    graph: CorrespondenceGraph,
+    enabled: Vec<bool>,
+    /// Images of earlier components.
+    taken: Vec<bool>,
+    /// 2D-to-3D matches that an image had when it was last refused.
+    refused_at: Vec<usize>,
+    records: Vec<RegistrationRecord>,
+    images_at_last_global: usize,
+    seed: u64,
+}
+
+impl<'a> Mapper<'a> {
+    fn new(
+        params: &'a MapperParams,
+        input: &'a MapperInput<'a>,
+        taken: Vec<bool>,
+        seed: u64,
+    ) -> Option<Self> {
+        let enabled: Vec<bool> = input
+            .pairs
+            .iter()
+            .map(|pair| !taken[pair.first.index()] && !taken[pair.second.index()])
+            .collect();
+        if !enabled.contains(&true) {
+            return None;
+        }
+        let counts: Vec<usize> = input.images.iter().map(|image| image.features.len()).collect();
+        Some(Self {
+            params,
+            model: Model::new(input),
+            graph: CorrespondenceGraph::build(&counts, input.pairs, &enabled),
+            enabled,
+            taken,
+            refused_at: vec![0; input.images.len()],
+            records: Vec::new(),
+            images_at_last_global: 2,
+            seed,
+        })
+    }
+
+    fn initialize(&mut self) -> bool {
+        for candidate in initial::ranked_pairs(self.params, &self.model, &self.graph, &self.enabled) {
+            let pair = &self.model.input.pairs[candidate];
+            let (first, second) = (pair.first, pair.second);
+            self.model.set_pose(first, Some(crate::Rigid::identity()));
+            self.model.set_pose(second, Some(pair.two_view.second_from_first.inverse()));
+            triangulate_image(&mut self.model, &self.graph, self.params.limits(), first);
+            self.adjust_all(30);
+            filter(&mut self.model, self.params.limits());
+            triangulate_image(&mut self.model, &self.graph, self.params.limits(), first);
+            if self.model.observed_points(first) >= self.params.min_initial_points {
+                return true;
+            }
+            self.model.unregister(first);
+            self.model.unregister(second);
+        }
+        false
+    }
+
+    fn grow(&mut self) {
+        while let Some((image, hypothesis)) = self.next_image() {
+            register(&mut self.model, image, &hypothesis);
+            triangulate_image(&mut self.model, &self.graph, self.params.limits(), image);
+            let scope = Scope::local(&self.model, image, self.params.local_bundle_images);
+            adjust(&mut self.model, &self.params.bundle(10), &scope);
+            filter(&mut self.model, self.params.limits());
+            triangulate_image(&mut self.model, &self.graph, self.params.limits(), image);
+            let count = self.model.registered_count();
+            if count as f64 >= self.images_at_last_global as f64 * self.params.global_bundle_growth
+                || count <= 4
+            {
+                self.refine(1, 10);
+                self.images_at_last_global = count;
+                self.expel_misplaced();
+            }
+        }
+    }
+
+    /// The image to register next: the best supported acceptable pose among the few with most matches.
+    fn next_image(&mut self) -> Option<(ImageId, PoseHypothesis)> {
+        let mut waiting: Vec<(usize, ImageId)> = (0..self.model.poses.len() as u32)
+            .map(ImageId)
+            .filter(|&image| !self.model.is_registered(image) && !self.taken[image.index()])
+            .map(|image| (scene_matches(&self.model, &self.graph, image).len(), image))
+            .filter(|&(count, image)| {
+                count >= self.params.min_registration_inliers
+                    && count > self.refused_at[image.index()] * 11 / 10
+            })
+            .collect();
+        waiting.sort_by_key(|&(count, image)| (std::cmp::Reverse(count), image));
+        let mut best: Option<(ImageId, PoseHypothesis)> = None;
+        for (tried, (count, image)) in waiting.into_iter().enumerate() {
+            if tried >= 3 && best.is_some() {
+                break;
+            }
+            match self.acceptable_pose(image) {
+                Some(hypothesis) => {
+                    if best.as_ref().is_none_or(|(_, other)| hypothesis.inliers.len() > other.inliers.len()) {
+                        best = Some((image, hypothesis));
+                    }
+                }
+                None => self.refused_at[image.index()] = count,
+            }
+        }
+        best
+    }
+
+    fn acceptable_pose(&mut self, image: ImageId) -> Option<PoseHypothesis> {
+        let seed = self.seed ^ (u64::from(image.0) << 32);
+        let hypotheses = hypothesize(
+            &self.model,
+            &self.graph,
+            image,
+            &self.params.ransac(),
+            self.params.max_pose_hypotheses,
+            seed,
+        );
+        let mut best: Option<PoseHypothesis> = None;
+        let mut refused_before = false;
+        for hypothesis in hypotheses {
+            let seen = hypothesis.visibility;
+            let judged = seen.expected >= self.params.min_visible_points;
+            // Where a better supported pose was refused, this one needs evidence of its own.
+            let plausible =
+                if judged { seen.recall() >= self.params.min_visibility_recall } else { !refused_before };
+            let accepted = plausible && hypothesis.inliers.len() >= self.params.min_registration_inliers;
+            refused_before |= !accepted;
+            self.records.push(RegistrationRecord {
+                image,
+                accepted,
+                candidates: hypothesis.candidates,
+                inliers: hypothesis.inliers.len(),
+                expected: seen.expected,
+                matched: seen.matched,
+            });
+            if accepted && best.is_none() {
+                best = Some(hypothesis);
+            }
+        }
+        best
+    }
+
+    /// Takes out images that do not see what their neighbours in the model see.
+    ///
+    /// An image that came in through a repeated façade (the initial pair too) is found out once the true surroundings
+    /// of the place have been mapped. It is offered again when more of the model can be matched to it.
+    fn expel_misplaced(&mut self) -> usize {
+        let mut expelled = 0;
+        for image in self.model.registered().collect::<Vec<_>>() {
+            if self.model.registered_count() <= 3 {
+                break;
+            }
+            let Some(pose) = self.model.poses[image.index()] else { continue };
+            let seen =
+                visibility(&self.model, image, &pose.world_from_camera, &self.model.observations_of(image));
+            if seen.expected >= self.params.min_visible_points
+                && seen.recall() < self.params.min_visibility_recall
+            {
+                self.records.push(RegistrationRecord {
+                    image,
+                    accepted: false,
+                    candidates: self.model.observed_points(image),
+                    inliers: self.model.observed_points(image),
+                    expected: seen.expected,
+                    matched: seen.matched,
+                });
+                self.model.unregister(image);
+                self.refused_at[image.index()] = scene_matches(&self.model, &self.graph, image).len();
+                expelled += 1;
+            }
+        }
+        expelled
+    }
+
+    fn adjust_all(&mut self, max_iterations: u32) {
+        let scope = Scope::global(&self.model);
+        adjust(&mut self.model, &self.params.bundle(max_iterations), &scope);
+    }
+
+    /// Adjusts everything, drops what disagrees and takes in what now agrees, `rounds` times or until nothing changes.
+    fn refine(&mut self, rounds: usize, max_iterations: u32) {
+        for _ in 0..rounds {
+            let observations: usize = self.model.live_points().map(|(_, point)| point.track.len()).sum();
+            self.adjust_all(max_iterations);
+            let limits = self.params.limits();
+            let mut changes = filter(&mut self.model, limits);
+            let before: usize = self.model.live_points().count();
+            for image in self.model.registered().collect::<Vec<_>>() {
+                triangulate_image(&mut self.model, &self.graph, limits, image);
+            }
+            changes += self.model.live_points().count() - before;
+            changes += complete_and_merge(&mut self.model, &self.graph, limits);
+            if changes * 1000 < observations {
+                break;
+            }
+        }
+    }
+
+    fn finish(&mut self) {
+        self.refine(2, 20);
+        // Whoever is taken out may find its right place in the finished surroundings.
+        for _ in 0..3 {
+            if self.expel_misplaced() == 0 {
+                break;
+            }
+            self.grow();
+        }
+        self.refine(4, 20);
+        self.adjust_all(30);
+        filter(&mut self.model, self.params.limits());
+    }
 }

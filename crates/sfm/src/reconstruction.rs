@@ -73,7 +73,9 @@ pub struct Reconstruction {
 impl Reconstruction {
     /// Ids of the registered images, ascending.
     pub fn registered(&self) -> impl Iterator<Item = ImageId> + '_ {
-        (0..self.images.len() as u32).map(ImageId).filter(|id| self.images[id.index()].world_from_camera.is_some())
+        (0..self.images.len() as u32)
+            .map(ImageId)
+            .filter(|id| self.images[id.index()].world_from_camera.is_some())
     }
 
     /// The camera of an image.
@@ -89,7 +91,8 @@ impl Reconstruction {
     /// Moves the whole component into another frame.
     pub fn transform(&mut self, target_from_world: &Similarity) {
         for image in &mut self.images {
-            image.world_from_camera = image.world_from_camera.map(|pose| target_from_world.transform_pose(&pose));
+            image.world_from_camera =
+                image.world_from_camera.map(|pose| target_from_world.transform_pose(&pose));
         }
         for point in &mut self.points {
             point.position = target_from_world.transform_point(&point.position);

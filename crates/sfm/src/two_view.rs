@@ -1,7 +1,16 @@
+//! Verification of putative matches between two images on the sphere.
+
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Match, Rays};
 
-use crate::{ImageId, Rigid};
+use crate::{
+    ImageId, Rigid,
+    robust::{RansacParams, estimate_relative_pose, estimate_rotation},
+};
+
+/// Bumped when equal inputs and parameters give another geometry.
+pub const TWO_VIEW_VERSION: u32 = 1;
 
 /// How to verify a pair.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -9,11 +18,31 @@ use crate::{ImageId, Rigid};
 pub struct TwoViewParams {
     /// Fewest inliers of a verified pair.
     pub min_inliers: usize,
+    /// Largest tangent Sampson error of an inlier, in standard deviations.
+    pub max_error_sigma: f64,
+    /// Median parallax below which a pair counts as a pure rotation, in degrees.
+    pub min_parallax_deg: f64,
+    /// Share of the inliers that a rotation alone must explain for the pair to count as one.
+    pub rotation_share: f64,
+    /// Most samples drawn for one geometry; below a third of inliers a pair is worth little to the mapper.
+    pub max_iterations: u32,
+    /// Most geometries of one pair.
+    pub max_geometries: usize,
+    /// Inliers of a further geometry, as a share of the first's.
+    pub min_runner_up_share: f64,
 }
 
 impl Default for TwoViewParams {
     fn default() -> Self {
-        Self { min_inliers: 20 }
+        Self {
+            min_inliers: 20,
+            max_error_sigma: 4.0,
+            min_parallax_deg: 0.5,
+            rotation_share: 0.8,
+            max_iterations: 2500,
+            max_geometries: 2,
+            min_runner_up_share: 0.2,
+        }
     }
 }
 
@@ -24,8 +53,6 @@ pub enum TwoViewKind {
     General,
     /// A rotation explains the matches: no parallax, not for initialization.
     PureRotation,
-    /// A plane explains nearly all matches: the pose is right but weaker.
-    Planar,
 }
 
 /// The verified geometry of two images.
@@ -33,7 +60,7 @@ pub enum TwoViewKind {
 pub struct TwoView {
     /// Kind of geometry.
     pub kind: TwoViewKind,
-    /// Pose of the first camera in the second's frame, translation of unit length (zero for pure rotation).
+    /// Pose of the first camera in the second's frame, translation of unit length (meaningless for pure rotation).
     pub second_from_first: Rigid,
     /// The matches that agree, sorted by `first`.
     pub inliers: Vec<Match>,
@@ -52,7 +79,88 @@ pub struct PairGeometry {
     pub two_view: TwoView,
 }
 
-/// Verifies putative matches on the sphere; `None` when no geometry is supported.
-pub fn verify_pair(_params: &TwoViewParams, _first: &Rays, _second: &Rays, _matches: &[Match], _seed: u64) -> Option<TwoView> {
-    None
+/// Verifies putative matches by essential matrices on rays; empty when too few agree.
+///
+/// Where façades repeat, the wrong alignment of two neighbours can have more matches than the right one. So a second
+/// geometry is sought among the matches that the first leaves over, and both are returned, best supported first; the
+/// mapper decides. `first` and `second` are the rays of all keypoints of the two images, `matches` index into them.
+pub fn verify_pair(
+    params: &TwoViewParams,
+    first: &Rays,
+    second: &Rays,
+    matches: &[Match],
+    seed: u64,
+) -> Vec<TwoView> {
+    let mut remaining = matches.to_vec();
+    let mut found: Vec<TwoView> = Vec::new();
+    while found.len() < params.max_geometries {
+        let Some(view) =
+            verify_once(params, first, second, &remaining, seed.wrapping_add(found.len() as u64))
+        else {
+            break;
+        };
+        let share = view.inliers.len() as f64 / found.first().map_or(1, |best| best.inliers.len()) as f64;
+        if !found.is_empty() && share < params.min_runner_up_share {
+            break;
+        }
+        remaining.retain(|m| view.inliers.binary_search(m).is_err());
+        found.push(view);
+    }
+    found
+}
+
+fn verify_once(
+    params: &TwoViewParams,
+    first: &Rays,
+    second: &Rays,
+    matches: &[Match],
+    seed: u64,
+) -> Option<TwoView> {
+    if matches.len() < params.min_inliers {
+        return None;
+    }
+    let gather = |rays: &Rays, index: &dyn Fn(&Match) -> u32| -> (Vec<Vector3<f64>>, Vec<f64>) {
+        matches.iter().map(|m| (rays.bearings[index(m) as usize], rays.sigmas[index(m) as usize])).unzip()
+    };
+    let (first_bearings, first_sigmas) = gather(first, &|m| m.first);
+    let (second_bearings, second_sigmas) = gather(second, &|m| m.second);
+    let ransac = RansacParams {
+        max_error_sigma: params.max_error_sigma,
+        min_inliers: params.min_inliers,
+        max_iterations: params.max_iterations,
+        confidence: 0.999,
+        ..RansacParams::default()
+    };
+    let estimate = estimate_relative_pose(
+        &ransac,
+        &first_bearings,
+        &second_bearings,
+        &first_sigmas,
+        &second_sigmas,
+        seed,
+    )?;
+    if estimate.inliers.len() < params.min_inliers {
+        return None;
+    }
+    let rotation = estimate.second_from_first.rotation;
+    let mut parallaxes: Vec<f64> = estimate
+        .inliers
+        .iter()
+        .map(|&index| (rotation * first_bearings[index as usize]).angle(&second_bearings[index as usize]))
+        .collect();
+    let middle = parallaxes.len() / 2;
+    let median_parallax_rad = *parallaxes.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let rotation_only = median_parallax_rad < params.min_parallax_deg.to_radians()
+        || estimate_rotation(&ransac, &first_bearings, &second_bearings, &first_sigmas, &second_sigmas, seed)
+            .is_some_and(|found| {
+                found.inliers.len() as f64 >= params.rotation_share * estimate.inliers.len() as f64
+            });
+    let mut inliers: Vec<Match> = estimate.inliers.iter().map(|&index| matches[index as usize]).collect();
+    inliers.sort_unstable();
+    Some(TwoView {
+        kind: if rotation_only { TwoViewKind::PureRotation } else { TwoViewKind::General },
+        second_from_first: estimate.second_from_first,
+        inliers,
+        median_parallax_rad,
+    })
 }

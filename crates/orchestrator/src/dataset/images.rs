@@ -145,7 +145,7 @@ impl ImageFolder {
 fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) -> Result<SourceImage> {
     let bytes = std::fs::read(path)?;
     anyhow::ensure!(!bytes.is_empty(), "the file is empty");
-    let info = stages::probe(&bytes).context("not a readable image")?;
+    let info = stages::probe(&bytes, &stages::DecodeLimits::default()).context("not a readable image")?;
     let known =
         cameras.find(name).filter(|camera| (camera.width, camera.height) == (info.width, info.height));
     let (camera, camera_fixed, camera_source) = if let Some(camera) = known {
@@ -153,7 +153,7 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
     } else {
         let (camera, source) = stages::guess_camera(&info);
         let fixed = camera.is_panoramic();
-        (camera, fixed, format!("{source:?}"))
+        (camera, fixed, source.to_string())
     };
     let exif = (*geo == GeoSource::Exif).then_some(info.metadata.gps).flatten();
     let position =

@@ -9,7 +9,8 @@ use nalgebra::Vector3;
 use serde_json::json;
 use setloc_features::{Camera, ImageFeatures, Match};
 use setloc_sfm::{
-    CameraId, ImageId, InputImage, MapperInput, PairGeometry, TwoView, reconstruct, verify_pair,
+    CameraId, GeoregisterParams, ImageId, InputImage, MapperInput, MapperParams, MapperReport, PairGeometry,
+    QualityParams, Reconstruction, TwoView, assess, georegister, reconstruct, verify_pair,
 };
 
 use super::{choose_pairs, derived_seed};
@@ -60,15 +61,19 @@ pub fn add_model(
     let placed: Vec<_> =
         cameras.of_image.iter().zip(positions).map(|(camera, position)| json!([camera, position])).collect();
     let params = json!({
-        "sfm": config.sfm, "seed": seed, "images": placed, "cameras": cameras.cameras, "camera_fixed": cameras.fixed,
+        "sfm": config.sfm, "quality": config.quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "camera_fixed": cameras.fixed,
     });
-    let mapper = config.sfm.clone();
+    let stage = ModelConfig {
+        mapper: config.sfm.clone(),
+        quality: config.quality.clone(),
+        georegistration: config.georegistration.clone(),
+    };
     let positions = positions.to_vec();
     let pair_list: Vec<(usize, usize, bool)> =
         pairs.iter().map(|&(a, b, _)| (a, b, is_swapped(images, a, b))).collect();
     let work = move |inputs: &Inputs<'_, '_>| {
         let input = ModelInput { cameras: &cameras, positions: &positions, pairs: &pair_list };
-        run_model(inputs, &mapper, &input, seed)
+        run_model(inputs, &stage, &input, seed)
     };
     let model = graph.add(Job {
         kind: if kind == ModelKind::Scene { "model" } else { "local_model" },
@@ -129,7 +134,8 @@ fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, config: &Config) 
 
 fn read_mask(path: &Path, hash: ContentHash) -> Result<stages::Mask> {
     let bytes = read_unchanged(path, hash)?;
-    stages::read_mask(&bytes).with_context(|| format!("mask {}", path.display()))
+    stages::Mask::decode(&bytes, &stages::DecodeLimits::default())
+        .with_context(|| format!("mask {}", path.display()))
 }
 
 /// The bytes that were hashed when the run was planned.
@@ -212,6 +218,13 @@ fn share_cameras(images: &[SourceImage]) -> SharedCameras {
     shared
 }
 
+/// Parameters of the mapping job.
+struct ModelConfig {
+    mapper: MapperParams,
+    quality: QualityParams,
+    georegistration: GeoregisterParams,
+}
+
 struct ModelInput<'a> {
     cameras: &'a SharedCameras,
     positions: &'a [Option<Vector3<f64>>],
@@ -220,10 +233,11 @@ struct ModelInput<'a> {
 
 fn run_model(
     inputs: &Inputs<'_, '_>,
-    params: &setloc_sfm::MapperParams,
+    config: &ModelConfig,
     input: &ModelInput<'_>,
     seed: u64,
 ) -> Result<Product> {
+    let ModelConfig { mapper: params, quality, georegistration } = config;
     let mut features: Vec<(usize, Arc<ImageFeatures>)> = Vec::new();
     let mut id_of = BTreeMap::new();
     for at in 0..input.positions.len() {
@@ -235,10 +249,11 @@ fn run_model(
     let mut pairs = Vec::new();
     for &(a, b, swapped) in input.pairs {
         let verified = inputs.find::<VerifiedPair>(&pair_role(a, b))?;
-        let two_view = verified.as_deref().and_then(|verified| verified.0.as_ref());
-        if let (Some(two_view), Some(&first), Some(&second)) = (two_view, id_of.get(&a), id_of.get(&b)) {
-            let two_view = if swapped { flip(two_view) } else { two_view.clone() };
-            pairs.push(PairGeometry { first, second, two_view });
+        if let (Some(verified), Some(&first), Some(&second)) = (verified, id_of.get(&a), id_of.get(&b)) {
+            for two_view in &verified.0 {
+                let two_view = if swapped { flip(two_view) } else { two_view.clone() };
+                pairs.push(PairGeometry { first, second, two_view });
+            }
         }
     }
     let names: Vec<String> = features.iter().map(|(at, _)| place_holder(*at)).collect();
@@ -250,7 +265,57 @@ fn run_model(
     });
     let images = images.collect();
     let (cameras, camera_fixed) = (input.cameras.cameras.clone(), input.cameras.fixed.clone());
-    Product::new(reconstruct(params, &MapperInput { cameras, camera_fixed, images, pairs: &pairs }, seed))
+    let positions: Vec<Option<Vector3<f64>>> = features.iter().map(|(at, _)| input.positions[*at]).collect();
+    let mut output = reconstruct(params, &MapperInput { cameras, camera_fixed, images, pairs: &pairs }, seed);
+    for (at, component) in output.components.iter_mut().enumerate() {
+        let report = assess(quality, component, &pairs);
+        output.report.warnings.extend(report.sentences(component));
+        if at > 0 {
+            let images: Vec<&str> =
+                component.registered().map(|image| component.images[image.index()].name.as_str()).collect();
+            output.report.warnings.push(format!(
+                "component {} is apart from the largest: {}",
+                at + 1,
+                images.join(", ")
+            ));
+        }
+        place(&mut output.report, georegistration, component, &positions, at == 0, seed);
+    }
+    Product::new(output)
+}
+
+/// Moves a component into the measured frame, when positions were given and fix it.
+fn place(
+    report: &mut MapperReport,
+    params: &GeoregisterParams,
+    component: &mut Reconstruction,
+    positions: &[Option<Vector3<f64>>],
+    is_main: bool,
+    seed: u64,
+) {
+    if positions.iter().flatten().next().is_none() {
+        return;
+    }
+    let upright: Vec<bool> =
+        component.images.iter().map(|image| component.cameras[image.camera.index()].is_panoramic()).collect();
+    let Some(placed) = georegister(params, component, positions, &upright, seed) else {
+        report.warnings.push(
+            "the measured positions do not fix where the model lies: it keeps its own frame".to_owned(),
+        );
+        return;
+    };
+    component.transform(&placed.enu_from_world);
+    for (image, distance, agrees) in &placed.residuals {
+        if !agrees {
+            let name = &component.images[image.index()].name;
+            report
+                .warnings
+                .push(format!("the measured position of {name} is {distance:.1} m off and was not used"));
+        }
+    }
+    if is_main {
+        report.georegistration = Some(placed);
+    }
 }
 
 /// Stands for an image's name inside models, so that a renamed image leaves them as they are.

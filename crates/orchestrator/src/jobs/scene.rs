@@ -72,7 +72,7 @@ pub fn add_scene(
         Product::new(SceneFile {
             components: output.components.iter().map(|model| named(model, &names)).collect(),
             index: (*index).clone(),
-            origin,
+            origin: output.report.georegistration.as_ref().and(origin),
             warnings: output.report.warnings.iter().map(|text| with_names(text, &names)).collect(),
             config: config.clone(),
         })

@@ -26,7 +26,10 @@ impl Rigid {
 
     /// A motion from a rotation matrix (assumed orthonormal) and a translation.
     pub fn from_matrix(rotation: &Matrix3<f64>, translation: Vector3<f64>) -> Self {
-        Self { rotation: UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(*rotation)), translation }
+        Self {
+            rotation: UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(*rotation)),
+            translation,
+        }
     }
 
     /// The motion that changes nothing.
@@ -56,6 +59,9 @@ impl std::ops::Mul for Rigid {
 
     /// Composition: `c_from_a = c_from_b * b_from_a`.
     fn mul(self, rhs: Self) -> Self {
-        Self { rotation: self.rotation * rhs.rotation, translation: self.rotation * rhs.translation + self.translation }
+        Self {
+            rotation: self.rotation * rhs.rotation,
+            translation: self.rotation * rhs.translation + self.translation,
+        }
     }
 }

@@ -48,7 +48,10 @@ impl Similarity {
     ///
     /// The camera frame keeps its own unit of length, so the result is rigid.
     pub fn transform_pose(&self, source_from_camera: &Rigid) -> Rigid {
-        Rigid::new(self.rotation * source_from_camera.rotation, self.transform_point(&source_from_camera.translation))
+        Rigid::new(
+            self.rotation * source_from_camera.rotation,
+            self.transform_point(&source_from_camera.translation),
+        )
     }
 
     /// Least-squares similarity that maps `source` onto `target`, or `None` when it is not determined.

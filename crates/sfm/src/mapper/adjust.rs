@@ -1,0 +1,127 @@
+use std::collections::BTreeMap;
+
+use super::model::Model;
+use crate::{
+    ImageId, PointId,
+    bundle::{
+        self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, BundleReport,
+        IntrinsicsFreedom,
+    },
+};
+
+/// Which unknowns of the model an adjustment moves.
+#[derive(Debug)]
+pub(super) struct Scope {
+    /// Images whose poses move; their points move too.
+    pub free_images: Vec<ImageId>,
+    /// Points to adjust, with all their observations.
+    pub points: Vec<PointId>,
+    /// Whether unknown intrinsics move.
+    pub intrinsics: bool,
+}
+
+impl Scope {
+    /// Everything.
+    pub fn global(model: &Model<'_>) -> Self {
+        Self { free_images: model.registered().collect(), points: model.live_ids(), intrinsics: true }
+    }
+
+    /// `image` and the `neighbours` images that share most points with it.
+    pub fn local(model: &Model<'_>, image: ImageId, neighbours: usize) -> Self {
+        let mut shared = vec![0_usize; model.poses.len()];
+        let mut points = Vec::new();
+        for (id, point) in model.live_points() {
+            if point.track.iter().any(|seen| seen.image == image) {
+                points.push(id);
+                for seen in &point.track {
+                    shared[seen.image.index()] += 1;
+                }
+            }
+        }
+        let mut others: Vec<ImageId> =
+            model.registered().filter(|&other| other != image && shared[other.index()] > 0).collect();
+        others.sort_by_key(|other| (std::cmp::Reverse(shared[other.index()]), *other));
+        others.truncate(neighbours);
+        others.push(image);
+        Self { free_images: others, points, intrinsics: false }
+    }
+}
+
+/// Bundle-adjusts `scope` and writes the result back.
+///
+/// When every registered image is free the first one is held, which fixes six of the seven gauge freedoms; scale is
+/// left to the damping.
+pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope) -> BundleReport {
+    let mut pose_of_image: BTreeMap<ImageId, u32> = BTreeMap::new();
+    let mut problem = BundleProblem {
+        cameras: model.cameras.clone(),
+        camera_freedom: vec![IntrinsicsFreedom::FIXED; model.cameras.len()],
+        ..BundleProblem::default()
+    };
+    let is_free = |image: ImageId| scope.free_images.contains(&image);
+    let hold_first = model.registered().all(is_free);
+    let mut free = vec![false; model.poses.len()];
+    for &image in &scope.free_images {
+        free[image.index()] = true;
+    }
+    if hold_first && let Some(first) = model.registered().next() {
+        free[first.index()] = false;
+    }
+    if scope.intrinsics {
+        for (camera, &fixed) in model.input.camera_fixed.iter().enumerate() {
+            let users = model
+                .registered()
+                .filter(|image| model.input.images[image.index()].camera.index() == camera)
+                .count();
+            if !fixed && users >= 2 {
+                problem.camera_freedom[camera] = IntrinsicsFreedom::LENS;
+            }
+        }
+    }
+
+    let mut kept = Vec::with_capacity(scope.points.len());
+    for &id in &scope.points {
+        let Some(point) = model.point(id) else { continue };
+        let index = problem.points.len() as u32;
+        problem.points.push(BundlePoint { position: point.position, fixed: false });
+        kept.push(id);
+        for &seen in &point.track {
+            let Some(pose) = &model.poses[seen.image.index()] else { continue };
+            let next = problem.poses.len() as u32;
+            let pose_index = *pose_of_image.entry(seen.image).or_insert_with(|| {
+                problem.poses.push(BundlePose {
+                    camera: model.input.images[seen.image.index()].camera.0,
+                    world_from_camera: pose.world_from_camera,
+                    fixed: !free[seen.image.index()],
+                });
+                next
+            });
+            let keypoint = &model.input.images[seen.image.index()].features.keypoints[seen.feature as usize];
+            problem.observations.push(BundleObservation {
+                pose: pose_index,
+                point: index,
+                pixel: keypoint.pixel(),
+                noise_px: f64::from(keypoint.noise_px),
+            });
+        }
+    }
+    let report = bundle::solve(params, &mut problem);
+
+    for (camera, freedom) in problem.camera_freedom.iter().enumerate() {
+        if *freedom != IntrinsicsFreedom::FIXED && problem.cameras[camera].validate().is_ok() {
+            model.cameras[camera] = problem.cameras[camera].clone();
+            model.refresh_rays(camera);
+        }
+    }
+    for (&image, &pose) in &pose_of_image {
+        if free[image.index()] {
+            model.set_pose(image, Some(problem.poses[pose as usize].world_from_camera));
+        }
+    }
+    for (id, adjusted) in kept.into_iter().zip(&problem.points) {
+        if let Some(point) = &mut model.points[id.index()] {
+            point.position = adjusted.position;
+        }
+    }
+    report
+}

@@ -1,0 +1,282 @@
+use nalgebra::{Matrix3, Vector3};
+use setloc_features::{Camera, Rays};
+
+use super::MapperInput;
+use crate::{
+    ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint, Rigid,
+    solvers::triangulation::{WorldRay, triangulate},
+};
+
+/// A registered camera, with its rotation as a matrix because it is applied to every observation.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Pose {
+    pub world_from_camera: Rigid,
+    pub camera_from_world: Matrix3<f64>,
+}
+
+impl Pose {
+    pub fn new(world_from_camera: Rigid) -> Self {
+        let camera_from_world = world_from_camera.rotation.to_rotation_matrix().matrix().transpose();
+        Self { world_from_camera, camera_from_world }
+    }
+
+    pub fn center(&self) -> &Vector3<f64> {
+        &self.world_from_camera.translation
+    }
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct ModelPoint {
+    pub position: Vector3<f64>,
+    pub track: Vec<Observation>,
+}
+
+/// The model under construction: one component.
+#[derive(Debug)]
+pub(super) struct Model<'a> {
+    pub input: &'a MapperInput<'a>,
+    pub cameras: Vec<Camera>,
+    /// Rays of every image under the current intrinsics.
+    pub rays: Vec<Rays>,
+    pub poses: Vec<Option<Pose>>,
+    /// Deleted points leave `None`, so that ids stay valid.
+    pub points: Vec<Option<ModelPoint>>,
+    point_of_feature: Vec<Vec<u32>>,
+}
+
+const NO_POINT: u32 = u32::MAX;
+
+impl<'a> Model<'a> {
+    pub fn new(input: &'a MapperInput<'a>) -> Self {
+        let rays = input
+            .images
+            .iter()
+            .map(|image| image.features.rays(&input.cameras[image.camera.index()]))
+            .collect();
+        Self {
+            input,
+            cameras: input.cameras.clone(),
+            rays,
+            poses: vec![None; input.images.len()],
+            points: Vec::new(),
+            point_of_feature: input.images.iter().map(|image| vec![NO_POINT; image.features.len()]).collect(),
+        }
+    }
+
+    pub fn is_registered(&self, image: ImageId) -> bool {
+        self.poses[image.index()].is_some()
+    }
+
+    pub fn registered(&self) -> impl Iterator<Item = ImageId> + '_ {
+        (0..self.poses.len() as u32).map(ImageId).filter(|&image| self.is_registered(image))
+    }
+
+    pub fn registered_count(&self) -> usize {
+        self.poses.iter().flatten().count()
+    }
+
+    pub fn point_of(&self, observation: Observation) -> Option<PointId> {
+        let id = self.point_of_feature[observation.image.index()][observation.feature as usize];
+        (id != NO_POINT).then_some(PointId(id))
+    }
+
+    pub fn point(&self, id: PointId) -> Option<&ModelPoint> {
+        self.points[id.index()].as_ref()
+    }
+
+    pub fn live_points(&self) -> impl Iterator<Item = (PointId, &ModelPoint)> + '_ {
+        self.points
+            .iter()
+            .enumerate()
+            .filter_map(|(index, point)| Some((PointId(index as u32), point.as_ref()?)))
+    }
+
+    pub fn live_ids(&self) -> Vec<PointId> {
+        self.live_points().map(|(id, _)| id).collect()
+    }
+
+    /// Chord between the observed ray and the direction to a point, in standard deviations of the ray.
+    ///
+    /// The chord of the sphere (the paper's residual) is monotonic in the angle up to 180°, so a point behind a ray
+    /// has the largest error of all. `None` when the image is not registered.
+    pub fn error_sigma(&self, observation: Observation, position: &Vector3<f64>) -> Option<f64> {
+        let pose = self.poses[observation.image.index()].as_ref()?;
+        let rays = &self.rays[observation.image.index()];
+        let index = observation.feature as usize;
+        let direction = pose.camera_from_world * (position - pose.center());
+        let norm = direction.norm();
+        (norm > 0.0).then(|| (rays.bearings[index] - direction / norm).norm() / rays.sigmas[index])
+    }
+
+    pub fn world_ray(&self, observation: Observation) -> Option<WorldRay> {
+        let pose = self.poses[observation.image.index()].as_ref()?;
+        let rays = &self.rays[observation.image.index()];
+        let index = observation.feature as usize;
+        rays.sigmas[index].is_finite().then(|| WorldRay {
+            origin: *pose.center(),
+            direction: pose.camera_from_world.tr_mul(&rays.bearings[index]),
+            sigma: rays.sigmas[index],
+        })
+    }
+
+    /// Least-squares point of all registered observations, with the largest error in standard deviations and the
+    /// largest triangulation angle.
+    pub fn triangulate(&self, track: &[Observation]) -> Option<Triangulated> {
+        let rays: Vec<WorldRay> =
+            track.iter().filter_map(|&observation| self.world_ray(observation)).collect();
+        if rays.len() < 2 {
+            return None;
+        }
+        let position = triangulate(&rays)?;
+        let max_error_sigma = track
+            .iter()
+            .filter_map(|&observation| self.error_sigma(observation, &position))
+            .fold(0.0_f64, |worst, error| if error.is_nan() { f64::INFINITY } else { worst.max(error) });
+        Some(Triangulated { position, max_error_sigma, max_angle_rad: self.max_angle(&position, track) })
+    }
+
+    /// The largest angle under which two observing centres are seen from a point.
+    pub fn max_angle(&self, position: &Vector3<f64>, track: &[Observation]) -> f64 {
+        // One arc cosine for the narrowest cosine instead of one a pair: this runs for every point after every adjustment.
+        let mut narrowest_cosine = 1.0_f64;
+        let direction = |seen: &Observation| {
+            self.poses[seen.image.index()]
+                .as_ref()
+                .and_then(|pose| (pose.center() - position).try_normalize(0.0))
+        };
+        for (index, a) in track.iter().enumerate() {
+            let Some(to_a) = direction(a) else { continue };
+            for b in &track[index + 1..] {
+                if let Some(to_b) = direction(b) {
+                    narrowest_cosine = narrowest_cosine.min(to_a.dot(&to_b));
+                }
+            }
+        }
+        narrowest_cosine.clamp(-1.0, 1.0).acos()
+    }
+
+    pub fn add_point(&mut self, position: Vector3<f64>, track: Vec<Observation>) -> PointId {
+        let id = PointId(self.points.len() as u32);
+        for observation in &track {
+            self.point_of_feature[observation.image.index()][observation.feature as usize] = id.0;
+        }
+        self.points.push(Some(ModelPoint { position, track }));
+        id
+    }
+
+    pub fn remove_point(&mut self, id: PointId) {
+        if let Some(point) = self.points[id.index()].take() {
+            for observation in point.track {
+                self.point_of_feature[observation.image.index()][observation.feature as usize] = NO_POINT;
+            }
+        }
+    }
+
+    pub fn add_observation(&mut self, id: PointId, observation: Observation) {
+        if let Some(point) = &mut self.points[id.index()] {
+            point.track.push(observation);
+            self.point_of_feature[observation.image.index()][observation.feature as usize] = id.0;
+        }
+    }
+
+    pub fn remove_observation(&mut self, id: PointId, observation: Observation) {
+        if let Some(point) = &mut self.points[id.index()] {
+            point.track.retain(|kept| *kept != observation);
+            self.point_of_feature[observation.image.index()][observation.feature as usize] = NO_POINT;
+        }
+    }
+
+    /// Moves the observations of `from` to `into`, which gets a new position.
+    pub fn merge_points(&mut self, into: PointId, from: PointId, position: Vector3<f64>) {
+        let Some(moved) = self.points[from.index()].take() else { return };
+        for &observation in &moved.track {
+            self.add_observation(into, observation);
+        }
+        if let Some(point) = &mut self.points[into.index()] {
+            point.position = position;
+        }
+    }
+
+    pub fn set_pose(&mut self, image: ImageId, pose: Option<Rigid>) {
+        self.poses[image.index()] = pose.map(Pose::new);
+    }
+
+    /// Takes an image out of the model, with its observations; points left with one observer go too.
+    pub fn unregister(&mut self, image: ImageId) {
+        for feature in 0..self.point_of_feature[image.index()].len() as u32 {
+            let observation = Observation { image, feature };
+            if let Some(id) = self.point_of(observation) {
+                self.remove_observation(id, observation);
+                if self.point(id).is_some_and(|point| point.track.len() < 2) {
+                    self.remove_point(id);
+                }
+            }
+        }
+        self.set_pose(image, None);
+    }
+
+    /// The triangulated keypoints of an image.
+    pub fn observations_of(&self, image: ImageId) -> Vec<(u32, PointId)> {
+        let ids = self.point_of_feature[image.index()].iter().enumerate();
+        ids.filter(|&(_, &id)| id != NO_POINT).map(|(feature, &id)| (feature as u32, PointId(id))).collect()
+    }
+
+    /// Number of triangulated keypoints of an image.
+    pub fn observed_points(&self, image: ImageId) -> usize {
+        self.point_of_feature[image.index()].iter().filter(|&&id| id != NO_POINT).count()
+    }
+
+    /// Recomputes the rays of every image that uses `camera` after its intrinsics have changed.
+    pub fn refresh_rays(&mut self, camera: usize) {
+        for (index, image) in self.input.images.iter().enumerate() {
+            if image.camera.index() == camera {
+                self.rays[index] = image.features.rays(&self.cameras[camera]);
+            }
+        }
+    }
+
+    /// The finished component: points in creation order, tracks sorted, colours averaged.
+    pub fn into_reconstruction(self) -> Reconstruction {
+        let images = self
+            .input
+            .images
+            .iter()
+            .zip(&self.poses)
+            .map(|(image, pose)| ReconstructionImage {
+                name: image.name.to_owned(),
+                camera: image.camera,
+                world_from_camera: pose.map(|pose| pose.world_from_camera),
+            })
+            .collect();
+        let mut points = Vec::new();
+        for point in self.points.iter().flatten() {
+            let mut track = point.track.clone();
+            track.sort_unstable();
+            let (mut color_sum, mut squared_error) = ([0_u32; 3], 0.0);
+            for &observation in &track {
+                let color = self.input.images[observation.image.index()].features.colors
+                    [observation.feature as usize];
+                for channel in 0..3 {
+                    color_sum[channel] += u32::from(color[channel]);
+                }
+                squared_error += self.error_sigma(observation, &point.position).unwrap_or(0.0).powi(2);
+            }
+            let n = track.len().max(1);
+            points.push(ReconstructionPoint {
+                position: point.position,
+                color: color_sum.map(|sum| (sum / n as u32) as u8),
+                error_sigma: (squared_error / n as f64).sqrt(),
+                track,
+            });
+        }
+        Reconstruction { cameras: self.cameras, images, points }
+    }
+}
+
+/// A point hypothesis with what decides whether it is kept.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Triangulated {
+    pub position: Vector3<f64>,
+    pub max_error_sigma: f64,
+    pub max_angle_rad: f64,
+}

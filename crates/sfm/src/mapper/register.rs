@@ -1,0 +1,158 @@
+use nalgebra::Vector3;
+
+use super::{correspondence::CorrespondenceGraph, model::Model};
+use crate::{
+    ImageId, Observation, PointId, Rigid,
+    robust::{RansacParams, estimate_absolute_pose},
+    visibility::is_same_view,
+};
+
+/// A pose for an unregistered image, with the evidence for and against it.
+#[derive(Debug, Clone)]
+pub(super) struct PoseHypothesis {
+    pub world_from_camera: Rigid,
+    /// Keypoints and points that agree.
+    pub inliers: Vec<(u32, PointId)>,
+    /// 2D-to-3D matches it was chosen from.
+    pub candidates: usize,
+    pub visibility: Visibility,
+}
+
+/// How much of what the image ought to see from here was matched.
+///
+/// Two places that share a façade module pass every inlier test: the module's matches are geometrically perfect. What
+/// gives the wrong place away is everything around the module, which ought to be seen from there and is not (the
+/// *missing correspondences* of C. Zach, A. Irschara, H. Bischof, "What can missing correspondences tell us about 3D
+/// structure and motion?", CVPR 2008).
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Visibility {
+    /// Points that a registered camera with nearly the same view of them sees.
+    pub expected: usize,
+    /// Those of them that are inliers.
+    pub matched: usize,
+}
+
+impl Visibility {
+    pub fn recall(&self) -> f64 {
+        self.matched as f64 / self.expected.max(1) as f64
+    }
+}
+
+/// 2D-to-3D matches of an unregistered image through its verified pairs.
+pub(super) fn scene_matches(
+    model: &Model<'_>,
+    graph: &CorrespondenceGraph,
+    image: ImageId,
+) -> Vec<(u32, PointId)> {
+    let mut matches = Vec::new();
+    for feature in 0..model.input.images[image.index()].features.len() as u32 {
+        let start = matches.len();
+        for &partner in graph.partners(image, feature) {
+            if let Some(id) = model.point_of(partner)
+                && !matches[start..].contains(&(feature, id))
+            {
+                matches.push((feature, id));
+            }
+        }
+    }
+    matches
+}
+
+/// Up to `max_hypotheses` poses, best first: each is sought among the matches that the ones before leave over.
+pub(super) fn hypothesize(
+    model: &Model<'_>,
+    graph: &CorrespondenceGraph,
+    image: ImageId,
+    params: &RansacParams,
+    max_hypotheses: usize,
+    seed: u64,
+) -> Vec<PoseHypothesis> {
+    let mut matches = scene_matches(model, graph, image);
+    let candidates = matches.len();
+    let rays = &model.rays[image.index()];
+    let mut hypotheses = Vec::new();
+    for round in 0..max_hypotheses {
+        let bearings: Vec<Vector3<f64>> =
+            matches.iter().map(|(feature, _)| rays.bearings[*feature as usize]).collect();
+        let sigmas: Vec<f64> = matches.iter().map(|(feature, _)| rays.sigmas[*feature as usize]).collect();
+        let points: Vec<Vector3<f64>> =
+            matches.iter().filter_map(|(_, id)| model.point(*id).map(|point| point.position)).collect();
+        if points.len() != bearings.len() {
+            break;
+        }
+        let Some(estimate) =
+            estimate_absolute_pose(params, &bearings, &sigmas, &points, seed.wrapping_add(round as u64))
+        else {
+            break;
+        };
+        let inliers: Vec<(u32, PointId)> =
+            estimate.inliers.iter().map(|&index| matches[index as usize]).collect();
+        let visibility = visibility(model, image, &estimate.world_from_camera, &inliers);
+        let mut is_inlier = vec![false; matches.len()];
+        for &index in &estimate.inliers {
+            is_inlier[index as usize] = true;
+        }
+        let mut keep = is_inlier.iter().map(|inlier| !inlier);
+        matches.retain(|_| keep.next().unwrap_or(false));
+        hypotheses.push(PoseHypothesis {
+            world_from_camera: estimate.world_from_camera,
+            inliers,
+            candidates,
+            visibility,
+        });
+    }
+    hypotheses
+}
+
+/// Counts the points that a camera at this pose ought to see, and those among `inliers`.
+pub(super) fn visibility(
+    model: &Model<'_>,
+    image: ImageId,
+    world_from_camera: &Rigid,
+    inliers: &[(u32, PointId)],
+) -> Visibility {
+    let mut is_inlier = vec![false; model.points.len()];
+    for (_, id) in inliers {
+        is_inlier[id.index()] = true;
+    }
+    let camera = &model.cameras[model.input.images[image.index()].camera.index()];
+    let center = world_from_camera.translation;
+    let mut counts = Visibility::default();
+    for (id, point) in model.live_points() {
+        let familiar = point.track.iter().any(|seen| {
+            model.poses[seen.image.index()].as_ref().is_some_and(|pose| {
+                seen.image != image && is_same_view(&point.position, pose.center(), &center)
+            })
+        });
+        if !familiar {
+            continue;
+        }
+        let in_image = camera.is_panoramic()
+            || camera.project(&world_from_camera.inverse_transform_point(&point.position)).is_some_and(
+                |pixel| {
+                    pixel.x >= 0.0
+                        && pixel.y >= 0.0
+                        && pixel.x < f64::from(camera.width)
+                        && pixel.y < f64::from(camera.height)
+                },
+            );
+        if in_image {
+            counts.expected += 1;
+            counts.matched += usize::from(is_inlier[id.index()]);
+        }
+    }
+    counts
+}
+
+/// Registers an image at an accepted pose: its inliers become observations.
+pub(super) fn register(model: &mut Model<'_>, image: ImageId, hypothesis: &PoseHypothesis) {
+    model.set_pose(image, Some(hypothesis.world_from_camera));
+    for &(feature, id) in &hypothesis.inliers {
+        let observation = Observation { image, feature };
+        let free = model.point_of(observation).is_none()
+            && model.point(id).is_some_and(|point| !point.track.iter().any(|seen| seen.image == image));
+        if free {
+            model.add_observation(id, observation);
+        }
+    }
+}

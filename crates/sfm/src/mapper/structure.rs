@@ -1,0 +1,189 @@
+use super::{correspondence::CorrespondenceGraph, model::Model};
+use crate::{ImageId, Observation, PointId};
+
+/// What a point must satisfy to be kept.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PointLimits {
+    pub max_error_sigma: f64,
+    pub min_angle_rad: f64,
+}
+
+/// Continues existing points into `image` and creates new ones from its unexplained matches.
+pub(super) fn triangulate_image(
+    model: &mut Model<'_>,
+    graph: &CorrespondenceGraph,
+    limits: PointLimits,
+    image: ImageId,
+) {
+    let mut candidates = Vec::new();
+    for feature in 0..model.input.images[image.index()].features.len() as u32 {
+        let seed = Observation { image, feature };
+        if model.point_of(seed).is_none() && !continue_point(model, graph, limits, seed) {
+            create_point(model, graph, limits, seed, &mut candidates);
+        }
+    }
+}
+
+/// Adds `seed` to the partner's point that it agrees with best.
+fn continue_point(
+    model: &mut Model<'_>,
+    graph: &CorrespondenceGraph,
+    limits: PointLimits,
+    seed: Observation,
+) -> bool {
+    let mut best: Option<(f64, PointId)> = None;
+    for &partner in graph.partners(seed.image, seed.feature) {
+        let Some(id) = model.point_of(partner) else { continue };
+        let Some(point) = model.point(id) else { continue };
+        let Some(error) = model.error_sigma(seed, &point.position) else { continue };
+        if error <= limits.max_error_sigma
+            && best.is_none_or(|(lowest, _)| error < lowest)
+            && !point.track.iter().any(|seen| seen.image == seed.image)
+        {
+            best = Some((error, id));
+        }
+    }
+    if let Some((_, id)) = best {
+        model.add_observation(id, seed);
+    }
+    best.is_some()
+}
+
+/// Triangulates `seed` with each free partner and keeps the hypothesis that most of the others support.
+fn create_point(
+    model: &mut Model<'_>,
+    graph: &CorrespondenceGraph,
+    limits: PointLimits,
+    seed: Observation,
+    candidates: &mut Vec<Observation>,
+) {
+    candidates.clear();
+    candidates.push(seed);
+    for &partner in graph.partners(seed.image, seed.feature) {
+        if model.is_registered(partner.image)
+            && model.point_of(partner).is_none()
+            && !candidates.iter().any(|seen| seen.image == partner.image)
+        {
+            candidates.push(partner);
+        }
+    }
+    let mut best: Option<(usize, f64, Vec<Observation>)> = None;
+    for &partner in &candidates[1..] {
+        let Some(hypothesis) = model.triangulate(&[seed, partner]) else { continue };
+        if hypothesis.max_error_sigma > limits.max_error_sigma
+            || hypothesis.max_angle_rad < limits.min_angle_rad
+        {
+            continue;
+        }
+        let support: Vec<Observation> = candidates
+            .iter()
+            .copied()
+            .filter(|&seen| {
+                model
+                    .error_sigma(seen, &hypothesis.position)
+                    .is_some_and(|error| error <= limits.max_error_sigma)
+            })
+            .collect();
+        if support.len() >= 2
+            && best
+                .as_ref()
+                .is_none_or(|(count, angle, _)| (support.len(), hypothesis.max_angle_rad) > (*count, *angle))
+        {
+            best = Some((support.len(), hypothesis.max_angle_rad, support));
+        }
+    }
+    let Some((_, _, support)) = best else { return };
+    if let Some(refined) = model.triangulate(&support)
+        && refined.max_error_sigma <= limits.max_error_sigma
+        && refined.max_angle_rad >= limits.min_angle_rad
+    {
+        model.add_point(refined.position, support);
+    }
+}
+
+/// Extends every point along its matches and merges points that turn out to be one. Returns the changes made.
+pub(super) fn complete_and_merge(
+    model: &mut Model<'_>,
+    graph: &CorrespondenceGraph,
+    limits: PointLimits,
+) -> usize {
+    let mut changes = 0;
+    for id in model.live_ids() {
+        let mut next = 0;
+        // The track grows while it is walked, so what was just added is followed too.
+        while let Some(point) = model.point(id) {
+            let Some(&observation) = point.track.get(next) else { break };
+            next += 1;
+            for &partner in graph.partners(observation.image, observation.feature) {
+                if model.is_registered(partner.image) {
+                    changes += usize::from(match model.point_of(partner) {
+                        None => complete(model, limits, id, partner),
+                        Some(other) => other != id && merge(model, limits, id, other),
+                    });
+                }
+            }
+        }
+    }
+    changes
+}
+
+fn complete(model: &mut Model<'_>, limits: PointLimits, id: PointId, partner: Observation) -> bool {
+    let Some(point) = model.point(id) else { return false };
+    let agrees = !point.track.iter().any(|seen| seen.image == partner.image)
+        && model.error_sigma(partner, &point.position).is_some_and(|error| error <= limits.max_error_sigma);
+    if agrees {
+        model.add_observation(id, partner);
+    }
+    agrees
+}
+
+fn merge(model: &mut Model<'_>, limits: PointLimits, id: PointId, other: PointId) -> bool {
+    let (Some(a), Some(b)) = (model.point(id), model.point(other)) else { return false };
+    if a.track.iter().any(|seen| b.track.iter().any(|theirs| theirs.image == seen.image)) {
+        return false;
+    }
+    // Cheap refusal first: each centre of gravity must be near the rays of both.
+    let weight = a.track.len() as f64 / (a.track.len() + b.track.len()) as f64;
+    let middle = a.position * weight + b.position * (1.0 - weight);
+    let near = |seen: &Observation| {
+        model.error_sigma(*seen, &middle).is_some_and(|error| error <= 3.0 * limits.max_error_sigma)
+    };
+    if !a.track.iter().chain(&b.track).all(near) {
+        return false;
+    }
+    let joint: Vec<Observation> = a.track.iter().chain(&b.track).copied().collect();
+    match model.triangulate(&joint) {
+        Some(merged) if merged.max_error_sigma <= limits.max_error_sigma => {
+            model.merge_points(id, other, merged.position);
+            true
+        }
+        _ => false,
+    }
+}
+
+/// Drops observations and points that violate the limits. Returns the observations dropped.
+pub(super) fn filter(model: &mut Model<'_>, limits: PointLimits) -> usize {
+    let mut dropped = 0;
+    for id in model.live_ids() {
+        let Some(point) = model.point(id) else { continue };
+        let bad: Vec<Observation> = point
+            .track
+            .iter()
+            .copied()
+            .filter(|&seen| {
+                !model.error_sigma(seen, &point.position).is_some_and(|error| error <= limits.max_error_sigma)
+            })
+            .collect();
+        dropped += bad.len();
+        for observation in bad {
+            model.remove_observation(id, observation);
+        }
+        let Some(point) = model.point(id) else { continue };
+        if point.track.len() < 2 || !(model.max_angle(&point.position, &point.track) >= limits.min_angle_rad)
+        {
+            dropped += point.track.len();
+            model.remove_point(id);
+        }
+    }
+    dropped
+}

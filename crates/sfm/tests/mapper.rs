@@ -1,0 +1,249 @@
+//! The mapper on synthetic streets with exact truth.
+
+use nalgebra::{UnitQuaternion, Vector3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use setloc_features::{Camera, CameraModel, ImageFeatures, Keypoint, Match};
+use setloc_sfm::{
+    CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, PairGeometry, Rigid, Similarity,
+    TwoViewParams, reconstruct, verify_pair,
+};
+
+/// A street of points seen by cameras, with matches between all images that see a point.
+struct Street {
+    truth: Vec<Rigid>,
+    cameras: Vec<Camera>,
+    names: Vec<String>,
+    features: Vec<ImageFeatures>,
+    /// `point_of[image][feature]`; points with the same `look` cannot be told apart.
+    point_of: Vec<Vec<usize>>,
+    look: Vec<usize>,
+}
+
+impl Street {
+    const LENGTH: f64 = 60.0;
+
+    fn new(cameras: Vec<(Camera, Rigid)>, noise_px: f64, module_points: usize, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut points: Vec<Vector3<f64>> = (0..2400)
+            .map(|_| {
+                let side = if rng.random_bool(0.5) { 8.0 } else { -8.0 };
+                Vector3::new(
+                    side + rng.random_range(-0.8..0.8),
+                    rng.random_range(-9.0..1.5),
+                    rng.random_range(-10.0..Self::LENGTH + 10.0),
+                )
+            })
+            .collect();
+        let mut look: Vec<usize> = (0..points.len()).collect();
+        // One façade module stands at both ends of the street.
+        for _ in 0..module_points {
+            let at = Vector3::new(
+                8.0 + rng.random_range(-0.8..0.8),
+                rng.random_range(-9.0..1.5),
+                rng.random_range(0.0..8.0),
+            );
+            look.push(points.len());
+            points.push(at);
+            look.push(points.len() - 1);
+            points.push(at + Vector3::new(0.0, 0.0, 45.0));
+        }
+        let mut street =
+            Self { truth: vec![], cameras: vec![], names: vec![], features: vec![], point_of: vec![], look };
+        for (index, (camera, world_from_camera)) in cameras.into_iter().enumerate() {
+            let mut features =
+                ImageFeatures { width: camera.width, height: camera.height, ..ImageFeatures::default() };
+            let mut seen = Vec::new();
+            for (id, point) in points.iter().enumerate() {
+                let in_camera = world_from_camera.inverse_transform_point(point);
+                let Some(pixel) = camera.project(&in_camera) else { continue };
+                let x = pixel.x + rng.random_range(-1.7..1.7) * noise_px;
+                let y = pixel.y + rng.random_range(-1.7..1.7) * noise_px;
+                let inside =
+                    x >= 0.0 && y >= 0.0 && x < f64::from(camera.width) && y < f64::from(camera.height);
+                if inside && in_camera.norm() < 22.0 && rng.random_bool(0.8) {
+                    features.keypoints.push(Keypoint {
+                        x: x as f32,
+                        y: y as f32,
+                        size: 5.0,
+                        orientation: 0.0,
+                        noise_px: 1.0,
+                    });
+                    features.colors.push([128; 3]);
+                    seen.push(id);
+                }
+            }
+            street.truth.push(world_from_camera);
+            street.cameras.push(camera);
+            street.names.push(format!("image_{index:02}"));
+            street.features.push(features);
+            street.point_of.push(seen);
+        }
+        street
+    }
+
+    /// Panoramas every 5 m along the street, each turned its own way.
+    fn of_panoramas(count: usize, noise_px: f64, module_points: usize, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed);
+        let views = (0..count).map(|k| {
+            let center =
+                Vector3::new(rng.random_range(-1.5..1.5), rng.random_range(-0.2..0.2), k as f64 * 5.0);
+            let turn = UnitQuaternion::from_euler_angles(
+                rng.random_range(-0.05..0.05),
+                rng.random_range(-3.1..3.1),
+                rng.random_range(-0.05..0.05),
+            );
+            (Camera::equirectangular(3072, 1536), Rigid::new(turn, center))
+        });
+        Self::new(views.collect(), noise_px, module_points, seed)
+    }
+
+    fn matches(&self, a: usize, b: usize, rng: &mut ChaCha8Rng) -> Vec<Match> {
+        let mut found = Vec::new();
+        for (first, &p) in self.point_of[a].iter().enumerate() {
+            // A look-alike is taken for the point only where the point itself is not in sight.
+            let exact = self.point_of[b].iter().position(|&q| q == p);
+            let twin = || self.point_of[b].iter().position(|&q| self.look[q] == self.look[p]);
+            if let Some(second) = exact.or_else(twin)
+                && rng.random_bool(0.7)
+            {
+                found.push(Match { first: first as u32, second: second as u32 });
+            }
+        }
+        let outliers = found.len() / 4;
+        for _ in 0..outliers {
+            let (n, m) = (self.point_of[a].len(), self.point_of[b].len());
+            found.push(Match { first: rng.random_range(0..n) as u32, second: rng.random_range(0..m) as u32 });
+        }
+        found
+    }
+
+    fn map(&self, cameras: &[Camera], fixed: bool) -> MapperOutput {
+        let mut rng = ChaCha8Rng::seed_from_u64(99);
+        let rays: Vec<_> =
+            self.features.iter().zip(cameras).map(|(features, camera)| features.rays(camera)).collect();
+        let mut pairs = Vec::new();
+        for a in 0..self.features.len() {
+            for b in a + 1..self.features.len() {
+                let matches = self.matches(a, b, &mut rng);
+                for two_view in
+                    verify_pair(&TwoViewParams::default(), &rays[a], &rays[b], &matches, (a * 100 + b) as u64)
+                {
+                    pairs.push(PairGeometry {
+                        first: ImageId(a as u32),
+                        second: ImageId(b as u32),
+                        two_view,
+                    });
+                }
+            }
+        }
+        // Photos share one camera, panoramas have one each: both are allowed.
+        let shared = cameras.iter().all(|camera| camera == &cameras[0]);
+        let images = (0..self.features.len()).map(|index| InputImage {
+            name: &self.names[index],
+            camera: CameraId(if shared { 0 } else { index as u32 }),
+            features: &self.features[index],
+            position_prior: None,
+        });
+        let cameras = if shared { vec![cameras[0].clone()] } else { cameras.to_vec() };
+        let input = MapperInput {
+            camera_fixed: vec![fixed; cameras.len()],
+            cameras,
+            images: images.collect(),
+            pairs: &pairs,
+        };
+        reconstruct(&MapperParams::default(), &input, 5)
+    }
+
+    /// Largest centre error in metres and rotation error in degrees after alignment of the first component.
+    fn errors(&self, output: &MapperOutput) -> (usize, f64, f64) {
+        let component = &output.components[0];
+        let registered: Vec<ImageId> = component.registered().collect();
+        let pose = |image: &ImageId| component.images[image.index()].world_from_camera.unwrap();
+        let source: Vec<_> = registered.iter().map(|image| pose(image).translation).collect();
+        let target: Vec<_> = registered.iter().map(|image| self.truth[image.index()].translation).collect();
+        let truth_from_world = Similarity::from_point_pairs(&source, &target).unwrap();
+        let (mut worst_m, mut worst_deg) = (0.0_f64, 0.0_f64);
+        for image in &registered {
+            let aligned = truth_from_world.transform_pose(&pose(image));
+            let truth = &self.truth[image.index()];
+            worst_m = worst_m.max((aligned.translation - truth.translation).norm());
+            worst_deg = worst_deg.max(aligned.rotation.angle_to(&truth.rotation).to_degrees());
+        }
+        (registered.len(), worst_m, worst_deg)
+    }
+}
+
+#[test]
+fn a_street_of_panoramas_is_mapped_to_millimetres() {
+    let street = Street::of_panoramas(10, 0.3, 0, 1);
+    let output = street.map(&street.cameras, true);
+    let (registered, worst_m, worst_deg) = street.errors(&output);
+    assert_eq!((registered, output.components.len()), (10, 1));
+    assert!(worst_m < 0.01 && worst_deg < 0.02, "{worst_m} m {worst_deg} deg");
+}
+
+#[test]
+fn a_facade_that_stands_twice_does_not_fold_the_street() {
+    for seed in 2..5 {
+        let street = Street::of_panoramas(12, 0.3, 350, seed);
+        let output = street.map(&street.cameras, true);
+        let (registered, worst_m, worst_deg) = street.errors(&output);
+        assert_eq!(registered, 12, "seed {seed}");
+        assert!(worst_m < 0.02 && worst_deg < 0.05, "seed {seed}: {worst_m} m {worst_deg} deg");
+    }
+}
+
+#[test]
+fn the_unknown_focal_length_and_distortion_of_photos_are_found() {
+    let truth = Camera {
+        model: CameraModel::SimpleRadial,
+        width: 1600,
+        height: 1200,
+        params: vec![1250.0, 800.0, 600.0, -0.05],
+    };
+    let views = (0..9).map(|k| {
+        let turn = UnitQuaternion::from_euler_angles(0.0, -0.7 + 0.09 * f64::from(k), 0.0);
+        (
+            truth.clone(),
+            Rigid::new(turn, Vector3::new(3.0 - 0.7 * f64::from(k), 0.1 * f64::from(k % 3), f64::from(k))),
+        )
+    });
+    let street = Street::new(views.collect(), 0.3, 0, 3);
+    let guess = Camera { params: vec![1920.0, 800.0, 600.0, 0.0], ..truth.clone() };
+    let output = street.map(&vec![guess; 9], false);
+    let (registered, worst_m, _) = street.errors(&output);
+    let found = &output.components[0].cameras[0].params;
+    assert_eq!(registered, 9);
+    assert!((found[0] / truth.params[0] - 1.0).abs() < 0.01, "{found:?}");
+    assert!((found[3] - truth.params[3]).abs() < 0.01, "{found:?}");
+    assert!(worst_m < 0.05, "{worst_m} m");
+}
+
+#[test]
+fn two_streets_without_a_common_view_are_two_components() {
+    let mut street = Street::of_panoramas(10, 0.3, 0, 6);
+    for image in 5..10 {
+        for point in &mut street.point_of[image] {
+            *point += 100_000;
+        }
+    }
+    street.look = (0..200_000).collect();
+    let output = street.map(&street.cameras, true);
+    let sizes: Vec<usize> =
+        output.components.iter().map(|component| component.registered().count()).collect();
+    assert_eq!(sizes, [5, 5]);
+}
+
+#[test]
+fn same_input_same_seed_same_model_whatever_the_threads() {
+    let street = Street::of_panoramas(6, 0.3, 0, 8);
+    let on = |threads: usize| {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap()
+            .install(|| street.map(&street.cameras, true))
+    };
+    assert_eq!(on(1), on(2));
+}
