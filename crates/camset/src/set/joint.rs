@@ -89,7 +89,7 @@ impl Component<'_> {
         }
         let set_rays = set_rays(params, self.scene.index, &set_from_camera, &rays, &candidates);
         let rigid =
-            rigid_pose(params, &candidates, &set_rays, &set_from_camera, self.members, self.evidence, seed);
+            rigid_pose(params, &candidates, self.model, &set_rays, &set_from_camera, self.members, self.evidence, seed);
         let Some(rigid) = rigid else {
             let reasons =
                 vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];

@@ -1,9 +1,10 @@
 //! The pose of the rigid camera set, and whether another pose would do as well.
 
 use setloc_sfm::robust::{
-    GeneralizedPoseOptions, GeneralizedRay, GeneralizedSolver, RansacParams, estimate_generalized_pose,
+    GeneralizedPoseOptions, GeneralizedRay, GeneralizedSolver, RansacParams, estimate_absolute_pose,
+    estimate_generalized_pose,
 };
-use setloc_sfm::{Rigid, Similarity};
+use setloc_sfm::{Reconstruction, Rigid, Similarity};
 
 use super::PhotoEvidence;
 use super::correspondences::{SetCorrespondence, SetRays};
@@ -21,10 +22,12 @@ pub(crate) struct RigidPose {
     pub observability: Observability,
 }
 
-/// Finds the pose of greatest truncated score among those of the solver and those of photos localized alone.
+/// Finds the pose of greatest truncated score among those of the solver, those of photos localized alone and those
+/// that single photos suggest together with the depths of their local points.
 pub(crate) fn rigid_pose(
     params: &CamsetParams,
     correspondences: &[SetCorrespondence],
+    model: &Reconstruction,
     rays: &SetRays,
     set_from_camera: &[Rigid],
     members: &[usize],
@@ -34,6 +37,17 @@ pub(crate) fn rigid_pose(
     let count = correspondences.len();
     let mut candidates: Vec<Similarity> = estimate(params, rays, seed).into_iter().collect();
     candidates.extend(alignments(set_from_camera, members, evidence));
+    for (slot, &photo) in members.iter().enumerate() {
+        let in_set = &set_from_camera[slot];
+        let alone = evidence[photo].alone.world_from_camera.map(|in_world| {
+            Rigid::new(in_world.rotation * in_set.rotation.inverse(), in_world.translation)
+        });
+        let view = rays.of_slot(slot);
+        let sampled = view.absolute_pose(params, seed.wrapping_add(slot as u64));
+        for axes_at_photo in alone.into_iter().chain(sampled) {
+            candidates.extend(view.with_local_depths(params, &axes_at_photo, correspondences, model));
+        }
+    }
     let score = |pose: &Similarity| rays.score(pose, params.max_error_sigmas, count);
     let mut best: Option<(Similarity, f64)> = None;
     for candidate in candidates {
@@ -78,6 +92,77 @@ fn estimate(params: &CamsetParams, rays: &SetRays, seed: u64) -> Option<Similari
     let options = GeneralizedPoseOptions { solver, ..GeneralizedPoseOptions::default() };
     estimate_generalized_pose(&ransac, &generalized, &points, &options, seed)
         .map(|found| found.world_from_set)
+}
+
+/// Samples that a single photo's pose may cost.
+const PHOTO_SAMPLES: u32 = 3000;
+/// Fewest agreeing rays that make a single photo's pose worth a hypothesis; all rays of the set judge it afterwards.
+const PHOTO_INLIERS: usize = 5;
+/// Quantiles of the depth ratios that are tried as scale.
+const SCALE_QUANTILES: [f64; 3] = [0.5, 0.25, 0.75];
+
+impl SetRays {
+    fn of_slot(&self, slot: usize) -> Self {
+        let kept: Vec<usize> = (0..self.rays.len()).filter(|&ray| self.slot[ray] == slot).collect();
+        Self {
+            rays: kept.iter().map(|&ray| self.rays[ray]).collect(),
+            correspondence: kept.iter().map(|&ray| self.correspondence[ray]).collect(),
+            slot: vec![slot; kept.len()],
+        }
+    }
+
+    /// Pose of one photo's centre with the set's axes, from its own rays.
+    ///
+    /// Where only the first photos of a long set see the scene, hardly any of the set's matches are right, and samples
+    /// of four from all of them are hopeless; among one photo's own the share is far better.
+    fn absolute_pose(&self, params: &CamsetParams, seed: u64) -> Option<Rigid> {
+        let bearings: Vec<_> = self.rays.iter().map(|ray| ray.direction).collect();
+        let sigmas: Vec<f64> = self.rays.iter().map(|ray| ray.sigma).collect();
+        let points: Vec<_> = self.rays.iter().map(|ray| ray.point).collect();
+        let ransac = RansacParams {
+            max_error_sigma: params.max_error_sigmas,
+            max_iterations: PHOTO_SAMPLES,
+            min_inliers: PHOTO_INLIERS,
+            ..RansacParams::default()
+        };
+        estimate_absolute_pose(&ransac, &bearings, &sigmas, &points, seed).map(|found| found.world_from_camera)
+    }
+
+    /// The set's poses when this photo's is given: only scale is left, and each 3D-to-3D match whose ray agrees gives
+    /// it as the ratio of the point's distances in scene and local model.
+    fn with_local_depths(
+        &self,
+        params: &CamsetParams,
+        axes_at_photo: &Rigid,
+        correspondences: &[SetCorrespondence],
+        model: &Reconstruction,
+    ) -> Vec<Similarity> {
+        let mut ratios: Vec<f64> = Vec::new();
+        for (ray, &correspondence) in self.rays.iter().zip(&self.correspondence) {
+            let Some(local) = correspondences[correspondence].local.and_then(|local| model.points.get(local)) else {
+                continue;
+            };
+            let to_point = axes_at_photo.rotation.inverse_transform_vector(&(ray.point - axes_at_photo.translation));
+            let error = (to_point.normalize() - ray.direction).norm() / ray.sigma;
+            let ratio = to_point.norm() / (local.position - ray.origin).norm();
+            if error < params.max_error_sigmas && ratio.is_finite() && ratio > 0.0 {
+                ratios.push(ratio);
+            }
+        }
+        if ratios.len() < 3 {
+            return Vec::new();
+        }
+        ratios.sort_by(f64::total_cmp);
+        let origin = self.rays[0].origin;
+        SCALE_QUANTILES
+            .iter()
+            .map(|quantile| {
+                let scale = ratios[(quantile * (ratios.len() - 1) as f64).round() as usize];
+                let rotation = axes_at_photo.rotation;
+                Similarity { scale, rotation, translation: axes_at_photo.translation - rotation * origin * scale }
+            })
+            .collect()
+    }
 }
 
 /// Support of the best pose that the remaining rays give, when it puts the set elsewhere.
