@@ -71,6 +71,9 @@ struct Observations {
     tracks: Vec<TrackObservation>,
 }
 
+/// Observations that a photo's six degrees of freedom can fit whatever they are.
+const POSE_OBSERVATIONS: usize = 3;
+
 impl Component<'_> {
     /// Localizes the component.
     pub(crate) fn locate(&self, seed: u64) -> ComponentAnswer {
@@ -88,20 +91,30 @@ impl Component<'_> {
             scene_points[slot] += 1;
         }
         let set_rays = set_rays(params, self.scene.index, &set_from_camera, &rays, &candidates);
-        let rigid =
-            rigid_pose(params, &candidates, self.model, &set_rays, &set_from_camera, self.members, self.evidence, seed);
+        let rigid = rigid_pose(
+            params,
+            &candidates,
+            self.model,
+            &set_rays,
+            &set_from_camera,
+            self.members,
+            self.evidence,
+            seed,
+        );
         let Some(rigid) = rigid else {
             let reasons =
                 vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];
             return ComponentAnswer::Refused { reasons, scene_points };
         };
         let mut reasons = Vec::new();
-        let evidence = self.support(&rays, &set_from_camera, &candidates, &rigid);
-        let support = judge_support(&params.verdict, &evidence, &mut reasons);
-        if support == Verdict::NotLocalized {
+        let mut evidence = self.support(&rays, &set_from_camera, &candidates, &rigid);
+        if evidence.inliers < params.verdict.min_inliers {
+            judge_support(&params.verdict, &evidence, &mut reasons);
             return ComponentAnswer::Refused { reasons, scene_points };
         }
         let joint = self.refine_jointly(&set_from_camera, &candidates, &rigid);
+        evidence.log10_false_alarms = evidence.log10_false_alarms.min(self.joint_false_alarms(&joint));
+        let support = judge_support(&params.verdict, &evidence, &mut reasons);
         let refined = self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
         let undetermined = rigid.observability.undetermined();
         let mut rigid_support = support;
@@ -176,6 +189,26 @@ impl Component<'_> {
             cells,
             runner_up: rigid.runner_up,
         }
+    }
+
+    /// log₁₀ of the expected number of random placements of the set that explain as many features as this one.
+    ///
+    /// The ratio-tested matches of a long set are mostly wrong, because most of its photos do not see the scene, so
+    /// few right ones among them prove little. Guided matching is the sharper test: a feature counts when the scene
+    /// point that it resembles most falls within the search radius, which by chance is the radius' share of the
+    /// image. Three observations a photo are taken off, as many as a free pose can bend to.
+    fn joint_false_alarms(&self, joint: &Joint) -> f64 {
+        let (mut features, mut explained, mut chance) = (0, 0, 0.0);
+        for (slot, direct) in joint.direct.iter().enumerate() {
+            let count = self.photos[self.members[slot]].features.len();
+            let camera = &joint.model.cameras[self.camera_of(slot)];
+            let radius_share = std::f64::consts::PI * self.params.guided.radius_px.powi(2)
+                / (f64::from(camera.width) * f64::from(camera.height)).max(1.0);
+            features += count;
+            explained += direct.len().saturating_sub(POSE_OBSERVATIONS);
+            chance += radius_share * count as f64;
+        }
+        log10_false_alarms(features, explained, 0, (chance / features.max(1) as f64).min(1.0))
     }
 
     /// The paper's T_OPT, in rounds: observations are chosen under the present poses, then all poses move.

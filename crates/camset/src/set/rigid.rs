@@ -39,9 +39,10 @@ pub(crate) fn rigid_pose(
     candidates.extend(alignments(set_from_camera, members, evidence));
     for (slot, &photo) in members.iter().enumerate() {
         let in_set = &set_from_camera[slot];
-        let alone = evidence[photo].alone.world_from_camera.map(|in_world| {
-            Rigid::new(in_world.rotation * in_set.rotation.inverse(), in_world.translation)
-        });
+        let alone = evidence[photo]
+            .alone
+            .world_from_camera
+            .map(|in_world| Rigid::new(in_world.rotation * in_set.rotation.inverse(), in_world.translation));
         let view = rays.of_slot(slot);
         let sampled = view.absolute_pose(params, seed.wrapping_add(slot as u64));
         for axes_at_photo in alone.into_iter().chain(sampled) {
@@ -125,7 +126,8 @@ impl SetRays {
             min_inliers: PHOTO_INLIERS,
             ..RansacParams::default()
         };
-        estimate_absolute_pose(&ransac, &bearings, &sigmas, &points, seed).map(|found| found.world_from_camera)
+        estimate_absolute_pose(&ransac, &bearings, &sigmas, &points, seed)
+            .map(|found| found.world_from_camera)
     }
 
     /// The set's poses when this photo's is given: only scale is left, and each 3D-to-3D match whose ray agrees gives
@@ -139,10 +141,12 @@ impl SetRays {
     ) -> Vec<Similarity> {
         let mut ratios: Vec<f64> = Vec::new();
         for (ray, &correspondence) in self.rays.iter().zip(&self.correspondence) {
-            let Some(local) = correspondences[correspondence].local.and_then(|local| model.points.get(local)) else {
+            let Some(local) = correspondences[correspondence].local.and_then(|local| model.points.get(local))
+            else {
                 continue;
             };
-            let to_point = axes_at_photo.rotation.inverse_transform_vector(&(ray.point - axes_at_photo.translation));
+            let to_point =
+                axes_at_photo.rotation.inverse_transform_vector(&(ray.point - axes_at_photo.translation));
             let error = (to_point.normalize() - ray.direction).norm() / ray.sigma;
             let ratio = to_point.norm() / (local.position - ray.origin).norm();
             if error < params.max_error_sigmas && ratio.is_finite() && ratio > 0.0 {
@@ -159,7 +163,11 @@ impl SetRays {
             .map(|quantile| {
                 let scale = ratios[(quantile * (ratios.len() - 1) as f64).round() as usize];
                 let rotation = axes_at_photo.rotation;
-                Similarity { scale, rotation, translation: axes_at_photo.translation - rotation * origin * scale }
+                Similarity {
+                    scale,
+                    rotation,
+                    translation: axes_at_photo.translation - rotation * origin * scale,
+                }
             })
             .collect()
     }

@@ -54,7 +54,7 @@ pub struct MethodFigures {
     pub target: Option<PoseError>,
     /// Whether the target is registered.
     pub target_registered: bool,
-    /// Registered photos' errors by name.
+    /// Errors by name of all photos that have a pose, whatever the verdict.
     #[serde(skip)]
     pub errors: Errors,
     /// All photos' answers.
@@ -269,17 +269,23 @@ fn method_figures(
     alignment: Option<&Alignment>,
     truth: &BTreeMap<String, Rigid>,
 ) -> MethodFigures {
-    let localized = answers.iter().filter(|photo| photo.verdict == Verdict::Localized);
-    let registered: BTreeMap<String, Rigid> =
-        localized.filter_map(|photo| Some((photo.name.clone(), photo.world_from_camera?))).collect();
-    let errors = alignment.map_or_else(Errors::new, |alignment| errors_of(alignment, &registered, truth));
+    let posed: BTreeMap<String, Rigid> =
+        answers.iter().filter_map(|photo| Some((photo.name.clone(), photo.world_from_camera?))).collect();
+    let registered: Vec<&str> = answers
+        .iter()
+        .filter(|photo| photo.verdict == Verdict::Localized && photo.world_from_camera.is_some())
+        .map(|photo| photo.name.as_str())
+        .collect();
+    let of_all = alignment.map_or_else(Errors::new, |alignment| errors_of(alignment, &posed, truth));
+    let mut errors = of_all.clone();
+    errors.retain(|name, _| registered.contains(&name.as_str()));
     MethodFigures {
         registered: registered.len(),
         position_m: Bounds::of(errors.values().map(|error| error.position_m)),
         rotation_deg: Bounds::of(errors.values().map(|error| error.rotation_deg)),
         target: errors.get(target).copied(),
-        target_registered: registered.contains_key(target),
-        errors,
+        target_registered: registered.contains(&target),
+        errors: of_all,
         answers,
     }
 }

@@ -116,9 +116,9 @@ fn error_row(text: &mut String, set: &SetFigures, method: &str, figures: &Method
 
 /// One line an image and method: `set,method,name,position_m,rotation_deg,verdict,inliers`.
 pub fn errors_csv(figures: &DatasetFigures) -> String {
-    let mut text = String::from("set,method,name,position_m,rotation_deg,verdict,inliers\n");
+    let mut text = String::from("set,method,name,position_m,rotation_deg,verdict,inliers,reasons\n");
     for (name, error) in &figures.scene_errors {
-        add(&mut text, format_args!(",scene,{name},{},{},,\n", error.position_m, error.rotation_deg));
+        add(&mut text, format_args!(",scene,{name},{},{},,,\n", error.position_m, error.rotation_deg));
     }
     for set in &figures.sets {
         for (method, of_method) in &set.methods {
@@ -126,9 +126,13 @@ pub fn errors_csv(figures: &DatasetFigures) -> String {
                 let error = of_method.errors.get(&photo.name);
                 let error = error.map_or(",".to_owned(), |e| format!("{},{}", e.position_m, e.rotation_deg));
                 let (verdict, inliers) = (photo.verdict, photo.inliers);
+                let reasons = photo.reasons.join("; ").replace('"', "'");
                 add(
                     &mut text,
-                    format_args!("{},{method},{},{error},{verdict:?},{inliers}\n", set.name, photo.name),
+                    format_args!(
+                        "{},{method},{},{error},{verdict:?},{inliers},\"{reasons}\"\n",
+                        set.name, photo.name
+                    ),
                 );
             }
         }
