@@ -15,11 +15,11 @@ use self::{
     adjust::{Scope, adjust},
     correspondence::CorrespondenceGraph,
     model::Model,
-    register::{PoseHypothesis, hypothesize, register, scene_matches, visibility},
+    register::{PoseHypothesis, hypothesize, hypothesize_from_pairs, register, scene_matches, visibility},
     structure::{PointLimits, complete_and_merge, filter, triangulate_image},
 };
 use crate::{
-    CameraId, Georegistration, ImageId, PairGeometry, Reconstruction,
+    CameraId, Georegistration, ImageId, PairGeometry, Reconstruction, Rigid,
     bundle::{BundleParams, RobustLoss},
     robust::RansacParams,
 };
@@ -47,6 +47,10 @@ pub struct MapperParams {
     pub min_visibility_recall: f64,
     /// Points that must be in plain view for the recall to count.
     pub min_visible_points: usize,
+    /// Rotation from a verified pair's that still counts as agreement with it, in degrees.
+    pub max_pair_rotation_deg: f64,
+    /// Smallest share of the verified matches to registered images whose pairs must agree with a pose's rotation.
+    pub min_pair_agreement: f64,
     /// Poses tried for one image when repeated structure offers several.
     pub max_pose_hypotheses: usize,
     /// Images adjusted together with a new one.
@@ -68,6 +72,8 @@ impl Default for MapperParams {
             min_registration_inliers: 15,
             min_visibility_recall: 0.1,
             min_visible_points: 100,
+            max_pair_rotation_deg: 8.0,
+            min_pair_agreement: 0.2,
             max_pose_hypotheses: 3,
             local_bundle_images: 5,
             global_bundle_growth: 1.4,
@@ -233,7 +239,7 @@ impl<'a> Mapper<'a> {
         for candidate in initial::ranked_pairs(self.params, &self.model, &self.graph, &self.enabled) {
             let pair = &self.model.input.pairs[candidate];
             let (first, second) = (pair.first, pair.second);
-            self.model.set_pose(first, Some(crate::Rigid::identity()));
+            self.model.set_pose(first, Some(Rigid::identity()));
             self.model.set_pose(second, Some(pair.two_view.second_from_first.inverse()));
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), first);
             self.adjust_all(30);
@@ -298,24 +304,29 @@ impl<'a> Mapper<'a> {
 
     fn acceptable_pose(&mut self, image: ImageId) -> Option<PoseHypothesis> {
         let seed = self.seed ^ (u64::from(image.0) << 32);
-        let hypotheses = hypothesize(
-            &self.model,
-            &self.graph,
-            image,
-            &self.params.ransac(),
-            self.params.max_pose_hypotheses,
-            seed,
-        );
-        let mut best: Option<PoseHypothesis> = None;
+        let ransac = self.params.ransac();
+        let resected =
+            hypothesize(&self.model, &self.graph, image, &ransac, self.params.max_pose_hypotheses, seed);
+        self.first_accepted(image, resected).or_else(|| {
+            let mut from_pairs = hypothesize_from_pairs(&self.model, &self.graph, image, &ransac);
+            from_pairs.truncate(self.params.max_pose_hypotheses);
+            self.first_accepted(image, from_pairs)
+        })
+    }
+
+    fn first_accepted(&mut self, image: ImageId, hypotheses: Vec<PoseHypothesis>) -> Option<PoseHypothesis> {
         let mut refused_before = false;
         for hypothesis in hypotheses {
             let seen = hypothesis.visibility;
             let judged = seen.expected >= self.params.min_visible_points;
-            // Where a better supported pose was refused, this one needs evidence of its own.
+            // Where a better supported pose was refused for what it does not see, this one needs evidence of its own.
             let plausible =
                 if judged { seen.recall() >= self.params.min_visibility_recall } else { !refused_before };
-            let accepted = plausible && hypothesis.inliers.len() >= self.params.min_registration_inliers;
-            refused_before |= !accepted;
+            refused_before |= !plausible;
+            let accepted = plausible
+                && hypothesis.inliers.len() >= self.params.min_registration_inliers
+                && self.pair_agreement(image, &hypothesis.world_from_camera)
+                    >= self.params.min_pair_agreement;
             self.records.push(RegistrationRecord {
                 image,
                 accepted,
@@ -324,11 +335,35 @@ impl<'a> Mapper<'a> {
                 expected: seen.expected,
                 matched: seen.matched,
             });
-            if accepted && best.is_none() {
-                best = Some(hypothesis);
+            if accepted {
+                return Some(hypothesis);
             }
         }
-        best
+        None
+    }
+
+    /// Share of an image's verified matches to registered images that belong to pairs whose rotation agrees with a pose.
+    ///
+    /// Resection from a few points in one corner, or on one plane, can settle on a pose far from the true one; the
+    /// essential matrices of the same image rarely share that error.
+    fn pair_agreement(&self, image: ImageId, world_from_camera: &Rigid) -> f64 {
+        let (mut agreeing, mut all) = (0, 0);
+        for pair in self.model.input.pairs {
+            let other = match image {
+                _ if image == pair.first => pair.second,
+                _ if image == pair.second => pair.first,
+                _ => continue,
+            };
+            let Some(pose) = &self.model.poses[other.index()] else { continue };
+            let other_from_image = pose.world_from_camera.rotation.inverse() * world_from_camera.rotation;
+            let measured = pair.two_view.second_from_first.rotation;
+            let measured = if image == pair.first { measured } else { measured.inverse() };
+            all += pair.two_view.inliers.len();
+            if other_from_image.angle_to(&measured).to_degrees() <= self.params.max_pair_rotation_deg {
+                agreeing += pair.two_view.inliers.len();
+            }
+        }
+        if all == 0 { 1.0 } else { agreeing as f64 / all as f64 }
     }
 
     /// Takes out images that do not see what their neighbours in the model see.

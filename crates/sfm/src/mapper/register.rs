@@ -2,8 +2,8 @@ use nalgebra::Vector3;
 
 use super::{correspondence::CorrespondenceGraph, model::Model};
 use crate::{
-    ImageId, Observation, PointId, Rigid,
-    robust::{RansacParams, estimate_absolute_pose},
+    ImageId, Observation, PointId, Rigid, TwoViewKind,
+    robust::{RansacParams, estimate_absolute_pose, refine_absolute_pose},
     visibility::is_same_view,
 };
 
@@ -101,6 +101,88 @@ pub(super) fn hypothesize(
             visibility,
         });
     }
+    hypotheses
+}
+
+/// Poses that single verified pairs suggest, best supported first: rotation and direction are the pair's, the length of
+/// the baseline is the median over the 2D-to-3D matches.
+///
+/// After a turn, the points in common lie in one corner and have been seen along the road only, so that their depths
+/// are poor; resection then fits a wrong pose to them, while the essential matrix does not use depths at all.
+pub(super) fn hypothesize_from_pairs(
+    model: &Model<'_>,
+    graph: &CorrespondenceGraph,
+    image: ImageId,
+    params: &RansacParams,
+) -> Vec<PoseHypothesis> {
+    let matches = scene_matches(model, graph, image);
+    let rays = &model.rays[image.index()];
+    let (mut bearings, mut sigmas, mut points, mut ids) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for &(feature, id) in &matches {
+        if let Some(point) = model.point(id)
+            && rays.sigmas[feature as usize].is_finite()
+        {
+            bearings.push(rays.bearings[feature as usize]);
+            sigmas.push(rays.sigmas[feature as usize]);
+            points.push(point.position);
+            ids.push((feature, id));
+        }
+    }
+    let agreeing = |pose: &Rigid, bound: f64| -> Vec<u32> {
+        let agrees = |&index: &usize| {
+            let direction = pose.inverse_transform_point(&points[index]).normalize();
+            (direction - bearings[index]).norm() <= bound * sigmas[index]
+        };
+        (0..points.len()).filter(agrees).map(|index| index as u32).collect()
+    };
+    let mut hypotheses = Vec::new();
+    for pair in model.input.pairs {
+        let image_from_other = match image {
+            _ if image == pair.second => pair.two_view.second_from_first,
+            _ if image == pair.first => pair.two_view.second_from_first.inverse(),
+            _ => continue,
+        };
+        let other = if image == pair.first { pair.second } else { pair.first };
+        let Some(pose) = &model.poses[other.index()] else { continue };
+        if pair.two_view.kind == TwoViewKind::PureRotation {
+            continue;
+        }
+        let world_from_image = pose.world_from_camera * image_from_other.inverse();
+        let step = world_from_image.translation - pose.center();
+        // The centre lies at other + s·step; each point asks for the s that puts it on its ray: (X − C)×r = s·(step×r).
+        let mut lengths: Vec<f64> = (0..points.len())
+            .filter_map(|index| {
+                let ray = world_from_image.rotation * bearings[index];
+                let (wanted, lever) = ((points[index] - pose.center()).cross(&ray), step.cross(&ray));
+                let length = wanted.dot(&lever) / lever.norm_squared();
+                (length.is_finite() && length > 0.0).then_some(length)
+            })
+            .collect();
+        if lengths.len() < params.min_inliers {
+            continue;
+        }
+        let middle = lengths.len() / 2;
+        let length = *lengths.select_nth_unstable_by(middle, f64::total_cmp).1;
+        let mut found = Rigid::new(world_from_image.rotation, pose.center() + step * length);
+        for widening in [6.0, 3.0, 1.0] {
+            let near = agreeing(&found, widening * params.max_error_sigma);
+            if near.len() >= params.min_inliers {
+                found = refine_absolute_pose(params, &bearings, &sigmas, &points, &near, &found);
+            }
+        }
+        let inliers: Vec<(u32, PointId)> =
+            agreeing(&found, params.max_error_sigma).into_iter().map(|index| ids[index as usize]).collect();
+        if inliers.len() >= params.min_inliers {
+            let visibility = visibility(model, image, &found, &inliers);
+            hypotheses.push(PoseHypothesis {
+                world_from_camera: found,
+                inliers,
+                candidates: matches.len(),
+                visibility,
+            });
+        }
+    }
+    hypotheses.sort_by_key(|hypothesis| std::cmp::Reverse(hypothesis.inliers.len()));
     hypotheses
 }
 
