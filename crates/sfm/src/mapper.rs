@@ -2,6 +2,7 @@
 
 mod adjust;
 mod correspondence;
+mod direction;
 mod initial;
 mod model;
 mod register;
@@ -15,7 +16,7 @@ use self::{
     adjust::{Scope, adjust},
     correspondence::CorrespondenceGraph,
     model::Model,
-    register::{PoseHypothesis, hypothesize, hypothesize_from_pairs, register, scene_matches, visibility},
+    register::{PoseHypothesis, Visibility, hypothesize, hypothesize_from_pairs, register, scene_matches, visibility},
     structure::{PointLimits, complete_and_merge, filter, triangulate_image},
 };
 use crate::{
@@ -45,6 +46,9 @@ pub struct MapperParams {
     pub min_registration_inliers: usize,
     /// Smallest share of the points in plain view that a registration must match; guards against repeated structure.
     pub min_visibility_recall: f64,
+    /// Share of the directions with points in plain view in which any was matched that does as well: where all matching
+    /// is poor, recall is low everywhere, but a right pose has some matches all around.
+    pub min_visibility_coverage: f64,
     /// Points that must be in plain view for the recall to count.
     pub min_visible_points: usize,
     /// Rotation from a verified pair's that still counts as agreement with it, in degrees.
@@ -64,13 +68,14 @@ pub struct MapperParams {
 impl Default for MapperParams {
     fn default() -> Self {
         Self {
-            max_error_sigma: 4.0,
+            max_error_sigma: 6.0,
             min_triangulation_angle_deg: 1.0,
             min_initial_points: 50,
             min_initial_parallax_deg: 3.0,
             max_initial_pairs: 30,
             min_registration_inliers: 15,
             min_visibility_recall: 0.1,
+            min_visibility_coverage: 0.4,
             min_visible_points: 100,
             max_pair_rotation_deg: 8.0,
             min_pair_agreement: 0.2,
@@ -96,7 +101,7 @@ impl MapperParams {
 
     fn ransac(&self) -> RansacParams {
         RansacParams {
-            max_error_sigma: self.max_error_sigma * 1.5,
+            max_error_sigma: self.max_error_sigma,
             min_inliers: self.min_registration_inliers,
             ..RansacParams::default()
         }
@@ -144,6 +149,10 @@ pub struct RegistrationRecord {
     pub expected: usize,
     /// Those of them that were matched.
     pub matched: usize,
+    /// Directions with points in plain view.
+    pub expected_cells: usize,
+    /// Directions among them in which any was matched.
+    pub matched_cells: usize,
 }
 
 /// What happened, for people.
@@ -321,7 +330,7 @@ impl<'a> Mapper<'a> {
             let judged = seen.expected >= self.params.min_visible_points;
             // Where a better supported pose was refused for what it does not see, this one needs evidence of its own.
             let plausible =
-                if judged { seen.recall() >= self.params.min_visibility_recall } else { !refused_before };
+                if judged { self.is_recognized(&seen) } else { !refused_before };
             refused_before |= !plausible;
             let accepted = plausible
                 && hypothesis.inliers.len() >= self.params.min_registration_inliers
@@ -334,12 +343,19 @@ impl<'a> Mapper<'a> {
                 inliers: hypothesis.inliers.len(),
                 expected: seen.expected,
                 matched: seen.matched,
+                expected_cells: seen.expected_cells,
+                matched_cells: seen.matched_cells,
             });
             if accepted {
                 return Some(hypothesis);
             }
         }
         None
+    }
+
+    fn is_recognized(&self, seen: &Visibility) -> bool {
+        seen.recall() >= self.params.min_visibility_recall
+            || seen.coverage() >= self.params.min_visibility_coverage
     }
 
     /// Share of an image's verified matches to registered images that belong to pairs whose rotation agrees with a pose.
@@ -379,8 +395,7 @@ impl<'a> Mapper<'a> {
             let Some(pose) = self.model.poses[image.index()] else { continue };
             let seen =
                 visibility(&self.model, image, &pose.world_from_camera, &self.model.observations_of(image));
-            if seen.expected >= self.params.min_visible_points
-                && seen.recall() < self.params.min_visibility_recall
+            if seen.expected >= self.params.min_visible_points && !self.is_recognized(&seen)
             {
                 self.records.push(RegistrationRecord {
                     image,
@@ -389,6 +404,8 @@ impl<'a> Mapper<'a> {
                     inliers: self.model.observed_points(image),
                     expected: seen.expected,
                     matched: seen.matched,
+                    expected_cells: seen.expected_cells,
+                    matched_cells: seen.matched_cells,
                 });
                 self.model.unregister(image);
                 self.refused_at[image.index()] = scene_matches(&self.model, &self.graph, image).len();

@@ -36,7 +36,7 @@ impl Default for TwoViewParams {
     fn default() -> Self {
         Self {
             min_inliers: 20,
-            max_error_sigma: 4.0,
+            max_error_sigma: 6.0,
             min_parallax_deg: 0.5,
             rotation_share: 0.8,
             max_iterations: 2500,

@@ -1,7 +1,7 @@
 use nalgebra::Vector3;
 use setloc_features::Match;
 
-use super::{MapperParams, correspondence::CorrespondenceGraph, model::Model};
+use super::{MapperParams, correspondence::CorrespondenceGraph, direction, model::Model};
 use crate::{PairGeometry, TwoViewKind};
 
 /// Verified pairs worth starting from, best first, as indices into the input's pairs.
@@ -50,19 +50,11 @@ fn is_confirmed(graph: &CorrespondenceGraph, pair: &PairGeometry, m: &Match) -> 
         .any(|third| third.image != pair.second && theirs.contains(third))
 }
 
-/// Number of occupied cells of a grid on the sphere (a cube's faces, 8 × 8 each).
+/// Number of directions that hold at least one bearing.
 fn covered_cells<'b>(bearings: impl Iterator<Item = &'b Vector3<f64>>) -> usize {
-    const SIDE: usize = 8;
-    let mut occupied = [false; 6 * SIDE * SIDE];
-    for bearing in bearings {
-        let axis = bearing.iamax();
-        if bearing[axis] == 0.0 {
-            continue;
-        }
-        let face = axis * 2 + usize::from(bearing[axis] < 0.0);
-        let cell =
-            |value: f64| (((value / bearing[axis].abs() + 1.0) * 0.5 * SIDE as f64) as usize).min(SIDE - 1);
-        occupied[(face * SIDE + cell(bearing[(axis + 1) % 3])) * SIDE + cell(bearing[(axis + 2) % 3])] = true;
+    let mut occupied = [false; direction::CELLS];
+    for cell in bearings.filter_map(direction::cell) {
+        occupied[cell] = true;
     }
     occupied.iter().filter(|&&cell| cell).count()
 }

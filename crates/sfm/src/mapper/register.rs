@@ -1,6 +1,6 @@
 use nalgebra::Vector3;
 
-use super::{correspondence::CorrespondenceGraph, model::Model};
+use super::{correspondence::CorrespondenceGraph, direction, model::Model};
 use crate::{
     ImageId, Observation, PointId, Rigid, TwoViewKind,
     robust::{RansacParams, estimate_absolute_pose, refine_absolute_pose},
@@ -30,11 +30,20 @@ pub(super) struct Visibility {
     pub expected: usize,
     /// Those of them that are inliers.
     pub matched: usize,
+    /// Directions in which enough such points lie.
+    pub expected_cells: usize,
+    /// Directions among them in which at least one was matched.
+    pub matched_cells: usize,
 }
 
 impl Visibility {
     pub fn recall(&self) -> f64 {
         self.matched as f64 / self.expected.max(1) as f64
+    }
+
+    /// Share of the directions with points in plain view in which any was matched.
+    pub fn coverage(&self) -> f64 {
+        self.matched_cells as f64 / self.expected_cells.max(1) as f64
     }
 }
 
@@ -186,6 +195,9 @@ pub(super) fn hypothesize_from_pairs(
     hypotheses
 }
 
+/// Points in plain view that make a direction worth judging.
+const CELL_POINTS: usize = 5;
+
 /// Counts the points that a camera at this pose ought to see, and those among `inliers`.
 pub(super) fn visibility(
     model: &Model<'_>,
@@ -200,6 +212,7 @@ pub(super) fn visibility(
     let camera = &model.cameras[model.input.images[image.index()].camera.index()];
     let center = world_from_camera.translation;
     let mut counts = Visibility::default();
+    let mut cells = vec![(0_usize, 0_usize); direction::CELLS];
     for (id, point) in model.live_points() {
         let familiar = point.track.iter().any(|seen| {
             model.poses[seen.image.index()].as_ref().is_some_and(|pose| {
@@ -221,8 +234,15 @@ pub(super) fn visibility(
         if in_image {
             counts.expected += 1;
             counts.matched += usize::from(is_inlier[id.index()]);
+            if let Some(cell) = direction::cell(&(point.position - center)) {
+                cells[cell].0 += 1;
+                cells[cell].1 += usize::from(is_inlier[id.index()]);
+            }
         }
     }
+    let full = || cells.iter().filter(|(expected, _)| *expected >= CELL_POINTS);
+    counts.expected_cells = full().count();
+    counts.matched_cells = full().filter(|(_, matched)| *matched > 0).count();
     counts
 }
 
