@@ -71,7 +71,7 @@ impl FeatureParams {
 impl Default for FeatureParams {
     fn default() -> Self {
         Self {
-            max_features: 8192,
+            max_features: 16384,
             max_side: 4096,
             contrast_threshold: 0.04,
             edge_threshold: 10.0,

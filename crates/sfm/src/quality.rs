@@ -26,7 +26,7 @@ impl Default for QualityParams {
             max_rotation_deg: 3.0,
             min_shared_view: 0.03,
             min_expected_points: 150,
-            min_expected_share: 0.3,
+            min_expected_share: 0.6,
             min_image_points: 50,
         }
     }
