@@ -8,19 +8,21 @@ mod model;
 mod register;
 mod structure;
 
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, ImageFeatures};
 
 use self::{
-    adjust::{Scope, adjust},
+    adjust::{Scope, adjust, is_adjustable},
     correspondence::CorrespondenceGraph,
     model::Model,
-    register::{PoseHypothesis, Visibility, hypothesize, hypothesize_from_pairs, register, scene_matches, visibility},
+    register::{
+        PoseHypothesis, Visibility, hypothesize, hypothesize_from_pairs, register, scene_matches, visibility,
+    },
     structure::{PointLimits, complete_and_merge, filter, triangulate_image},
 };
 use crate::{
-    CameraId, Georegistration, ImageId, PairGeometry, Reconstruction, Rigid,
+    CameraId, Georegistration, ImageId, PairGeometry, Reconstruction, Rigid, TwoViewKind,
     bundle::{BundleParams, RobustLoss},
     robust::RansacParams,
 };
@@ -51,6 +53,8 @@ pub struct MapperParams {
     pub min_visibility_coverage: f64,
     /// Points that must be in plain view for the recall to count.
     pub min_visible_points: usize,
+    /// Fewest matches of a pure rotation that registers an image at the standpoint of another.
+    pub min_turn_matches: usize,
     /// Rotation from a verified pair's that still counts as agreement with it, in degrees.
     pub max_pair_rotation_deg: f64,
     /// Smallest share of the verified matches to registered images whose pairs must agree with a pose's rotation.
@@ -77,6 +81,7 @@ impl Default for MapperParams {
             min_visibility_recall: 0.1,
             min_visibility_coverage: 0.4,
             min_visible_points: 100,
+            min_turn_matches: 40,
             max_pair_rotation_deg: 8.0,
             min_pair_agreement: 0.2,
             max_pose_hypotheses: 3,
@@ -208,6 +213,8 @@ struct Mapper<'a> {
     enabled: Vec<bool>,
     /// Images of earlier components.
     taken: Vec<bool>,
+    /// The image that an image was turned from, and the turn.
+    anchors: Vec<Option<(ImageId, UnitQuaternion<f64>)>>,
     /// 2D-to-3D matches that an image had when it was last refused.
     refused_at: Vec<usize>,
     records: Vec<RegistrationRecord>,
@@ -237,6 +244,7 @@ impl<'a> Mapper<'a> {
             graph: CorrespondenceGraph::build(&counts, input.pairs, &enabled),
             enabled,
             taken,
+            anchors: vec![None; input.images.len()],
             refused_at: vec![0; input.images.len()],
             records: Vec::new(),
             images_at_last_global: 2,
@@ -264,11 +272,21 @@ impl<'a> Mapper<'a> {
     }
 
     fn grow(&mut self) {
-        while let Some((image, hypothesis)) = self.next_image() {
-            register(&mut self.model, image, &hypothesis);
+        loop {
+            let image = match self.next_image() {
+                Some((image, hypothesis)) => {
+                    register(&mut self.model, image, &hypothesis);
+                    image
+                }
+                None => match self.register_by_turn() {
+                    Some(image) => image,
+                    None => break,
+                },
+            };
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), image);
             let scope = Scope::local(&self.model, image, self.params.local_bundle_images);
             adjust(&mut self.model, &self.params.bundle(10), &scope);
+            self.follow_anchors();
             filter(&mut self.model, self.params.limits());
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), image);
             let count = self.model.registered_count();
@@ -278,6 +296,55 @@ impl<'a> Mapper<'a> {
                 self.refine(1, 10);
                 self.images_at_last_global = count;
                 self.expel_misplaced();
+            }
+        }
+    }
+
+    /// Registers an image at the standpoint of one that it is a mere turn away from.
+    ///
+    /// Photos taken by turning on the spot share no parallax, so they have no points in common to resect from; but the
+    /// turn itself is known best of all, and through it the next standpoint's matches reach the model.
+    fn register_by_turn(&mut self) -> Option<ImageId> {
+        let mut best: Option<(usize, ImageId, ImageId, UnitQuaternion<f64>)> = None;
+        for pair in self.model.input.pairs {
+            let matches = pair.two_view.inliers.len();
+            if pair.two_view.kind != TwoViewKind::PureRotation || matches < self.params.min_turn_matches {
+                continue;
+            }
+            let turn = pair.two_view.second_from_first.rotation;
+            for (image, anchor, image_from_anchor) in
+                [(pair.second, pair.first, turn), (pair.first, pair.second, turn.inverse())]
+            {
+                let open = !self.model.is_registered(image)
+                    && !self.taken[image.index()]
+                    && self.anchors[image.index()].is_none()
+                    && self.model.is_registered(anchor);
+                if open && best.is_none_or(|(most, ..)| matches > most) {
+                    best = Some((matches, image, anchor, image_from_anchor));
+                }
+            }
+        }
+        let (_, image, anchor, image_from_anchor) = best?;
+        self.anchors[image.index()] = Some((anchor, image_from_anchor));
+        self.place_by_turn(image);
+        Some(image)
+    }
+
+    fn place_by_turn(&mut self, image: ImageId) {
+        if let Some((anchor, image_from_anchor)) = self.anchors[image.index()]
+            && let Some(pose) = &self.model.poses[anchor.index()]
+        {
+            let world_from_anchor = pose.world_from_camera;
+            let rotation = world_from_anchor.rotation * image_from_anchor.inverse();
+            self.model.set_pose(image, Some(Rigid::new(rotation, world_from_anchor.translation)));
+        }
+    }
+
+    /// Images with too few points to be adjusted stay with the image that they were turned from.
+    fn follow_anchors(&mut self) {
+        for image in self.model.registered().collect::<Vec<_>>() {
+            if self.anchors[image.index()].is_some() && !is_adjustable(&self.model, image) {
+                self.place_by_turn(image);
             }
         }
     }
@@ -329,8 +396,7 @@ impl<'a> Mapper<'a> {
             let seen = hypothesis.visibility;
             let judged = seen.expected >= self.params.min_visible_points;
             // Where a better supported pose was refused for what it does not see, this one needs evidence of its own.
-            let plausible =
-                if judged { self.is_recognized(&seen) } else { !refused_before };
+            let plausible = if judged { self.is_recognized(&seen) } else { !refused_before };
             refused_before |= !plausible;
             let accepted = plausible
                 && hypothesis.inliers.len() >= self.params.min_registration_inliers
@@ -395,8 +461,7 @@ impl<'a> Mapper<'a> {
             let Some(pose) = self.model.poses[image.index()] else { continue };
             let seen =
                 visibility(&self.model, image, &pose.world_from_camera, &self.model.observations_of(image));
-            if seen.expected >= self.params.min_visible_points && !self.is_recognized(&seen)
-            {
+            if seen.expected >= self.params.min_visible_points && !self.is_recognized(&seen) {
                 self.records.push(RegistrationRecord {
                     image,
                     accepted: false,
@@ -418,6 +483,7 @@ impl<'a> Mapper<'a> {
     fn adjust_all(&mut self, max_iterations: u32) {
         let scope = Scope::global(&self.model);
         adjust(&mut self.model, &self.params.bundle(max_iterations), &scope);
+        self.follow_anchors();
     }
 
     /// Adjusts everything, drops what disagrees and takes in what now agrees, `rounds` times or until nothing changes.

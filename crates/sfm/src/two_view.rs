@@ -150,16 +150,22 @@ fn verify_once(
         .collect();
     let middle = parallaxes.len() / 2;
     let median_parallax_rad = *parallaxes.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let rotation_only = median_parallax_rad < params.min_parallax_deg.to_radians()
-        || estimate_rotation(&ransac, &first_bearings, &second_bearings, &first_sigmas, &second_sigmas, seed)
-            .is_some_and(|found| {
-                found.inliers.len() as f64 >= params.rotation_share * estimate.inliers.len() as f64
-            });
+    let turn =
+        estimate_rotation(&ransac, &first_bearings, &second_bearings, &first_sigmas, &second_sigmas, seed);
+    let explains =
+        turn.as_ref().map_or(0.0, |turn| turn.inliers.len() as f64 / estimate.inliers.len() as f64);
+    let rotation_only =
+        median_parallax_rad < params.min_parallax_deg.to_radians() || explains >= params.rotation_share;
+    let mut second_from_first = estimate.second_from_first;
+    if let Some(turn) = turn.filter(|_| rotation_only && explains >= params.rotation_share) {
+        // Without a baseline the essential matrix has directions to spare that its rotation soaks up.
+        second_from_first.rotation = turn.second_from_first;
+    }
     let mut inliers: Vec<Match> = estimate.inliers.iter().map(|&index| matches[index as usize]).collect();
     inliers.sort_unstable();
     Some(TwoView {
         kind: if rotation_only { TwoViewKind::PureRotation } else { TwoViewKind::General },
-        second_from_first: estimate.second_from_first,
+        second_from_first,
         inliers,
         median_parallax_rad,
     })

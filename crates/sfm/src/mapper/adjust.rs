@@ -47,6 +47,14 @@ impl Scope {
     }
 }
 
+/// Points that an image must see for its pose to be adjusted.
+const MIN_ADJUSTABLE_POINTS: usize = 12;
+
+/// Whether an image sees enough points for its own pose.
+pub(super) fn is_adjustable(model: &Model<'_>, image: ImageId) -> bool {
+    model.observed_points(image) >= MIN_ADJUSTABLE_POINTS
+}
+
 /// Bundle-adjusts `scope` and writes the result back.
 ///
 /// When every registered image is free the first one is held, which fixes six of the seven gauge freedoms; scale is
@@ -62,7 +70,7 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
     let hold_first = model.registered().all(is_free);
     let mut free = vec![false; model.poses.len()];
     for &image in &scope.free_images {
-        free[image.index()] = true;
+        free[image.index()] = is_adjustable(model, image);
     }
     if hold_first && let Some(first) = model.registered().next() {
         free[first.index()] = false;
