@@ -159,10 +159,12 @@ impl Street {
     fn errors(&self, output: &MapperOutput) -> (usize, f64, f64) {
         let component = &output.components[0];
         let registered: Vec<ImageId> = component.registered().collect();
-        let pose = |image: &ImageId| component.images[image.index()].world_from_camera.unwrap();
+        let pose =
+            |image: &ImageId| component.images[image.index()].world_from_camera.expect("is registered");
         let source: Vec<_> = registered.iter().map(|image| pose(image).translation).collect();
         let target: Vec<_> = registered.iter().map(|image| self.truth[image.index()].translation).collect();
-        let truth_from_world = Similarity::from_point_pairs(&source, &target).unwrap();
+        let truth_from_world =
+            Similarity::from_point_pairs(&source, &target).expect("centres are not collinear");
         let (mut worst_m, mut worst_deg) = (0.0_f64, 0.0_f64);
         for image in &registered {
             let aligned = truth_from_world.transform_pose(&pose(image));

@@ -9,7 +9,7 @@ use setloc_sfm::{PointId, Reconstruction, Rigid, Similarity};
 
 use super::PhotoEvidence;
 use super::correspondences::{SetCorrespondence, correspondences, set_rays};
-use super::rigid::{RigidPose, rigid_pose};
+use super::rigid::{RigidPose, SetPhotos, rigid_pose};
 use crate::evidence::{
     PhotoRays, SceneMatch, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose,
 };
@@ -91,16 +91,9 @@ impl Component<'_> {
             scene_points[slot] += 1;
         }
         let set_rays = set_rays(params, self.scene.index, &set_from_camera, &rays, &candidates);
-        let rigid = rigid_pose(
-            params,
-            &candidates,
-            self.model,
-            &set_rays,
-            &set_from_camera,
-            self.members,
-            self.evidence,
-            seed,
-        );
+        let photos =
+            SetPhotos { set_from_camera: &set_from_camera, members: self.members, evidence: self.evidence };
+        let rigid = rigid_pose(params, &candidates, self.model, &set_rays, &photos, seed);
         let Some(rigid) = rigid else {
             let reasons =
                 vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];

@@ -22,6 +22,13 @@ pub(crate) struct RigidPose {
     pub observability: Observability,
 }
 
+/// The photos of a local model: poses in the set's frame, indices among all photos, and what all photos know alone.
+pub(crate) struct SetPhotos<'a> {
+    pub set_from_camera: &'a [Rigid],
+    pub members: &'a [usize],
+    pub evidence: &'a [PhotoEvidence],
+}
+
 /// Finds the pose of greatest truncated score among those of the solver, those of photos localized alone and those
 /// that single photos suggest together with the depths of their local points.
 pub(crate) fn rigid_pose(
@@ -29,11 +36,10 @@ pub(crate) fn rigid_pose(
     correspondences: &[SetCorrespondence],
     model: &Reconstruction,
     rays: &SetRays,
-    set_from_camera: &[Rigid],
-    members: &[usize],
-    evidence: &[PhotoEvidence],
+    photos: &SetPhotos<'_>,
     seed: u64,
 ) -> Option<RigidPose> {
+    let SetPhotos { set_from_camera, members, evidence } = *photos;
     let count = correspondences.len();
     let mut candidates: Vec<Similarity> = estimate(params, rays, seed).into_iter().collect();
     candidates.extend(alignments(set_from_camera, members, evidence));

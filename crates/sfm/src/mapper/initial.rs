@@ -31,7 +31,7 @@ pub(super) fn ranked_pairs(
             let cells =
                 covered_cells(pair.two_view.inliers.iter().filter_map(|m| bearings.get(m.first as usize)));
             let parallax = (pair.two_view.median_parallax_rad / wanted).min(1.0);
-            let confirmed = pair.two_view.inliers.iter().filter(|m| is_confirmed(graph, pair, m)).count();
+            let confirmed = pair.two_view.inliers.iter().filter(|m| is_confirmed(graph, pair, **m)).count();
             // Two images alone have no third, so matches that nobody confirms still count a little.
             let support = confirmed as f64 + 0.1 * pair.two_view.inliers.len() as f64;
             (support * cells as f64 * parallax * parallax, index)
@@ -42,7 +42,7 @@ pub(super) fn ranked_pairs(
 }
 
 /// Whether one keypoint of a third image matches both keypoints of a match.
-fn is_confirmed(graph: &CorrespondenceGraph, pair: &PairGeometry, m: &Match) -> bool {
+fn is_confirmed(graph: &CorrespondenceGraph, pair: &PairGeometry, m: Match) -> bool {
     let theirs = graph.partners(pair.second, m.second);
     graph
         .partners(pair.first, m.first)
