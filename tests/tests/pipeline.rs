@@ -23,7 +23,9 @@ fn bench(dataset: &Path) -> DatasetFigures {
 fn assert_main_job(figures: &DatasetFigures) {
     let scene = &figures.scene;
     assert_eq!((scene.registered, scene.components), (scene.images, 1), "{scene:?}");
-    let (position, rotation) = (scene.position_m.unwrap(), scene.rotation_deg.unwrap());
+    // The panoramas of a street stand nearly on a line, about which centres alone leave the roll of the alignment to
+    // their noise; the rotations aligned by themselves have no such freedom.
+    let (position, rotation) = (scene.position_m.unwrap(), scene.rotation_own_deg.unwrap());
     assert!(position.median < 0.05 && rotation.median < 0.1, "{position:?} {rotation:?}");
     for set in &figures.sets {
         let (single, refined) = (&set.methods["single"], &set.methods["camset+opt"]);
