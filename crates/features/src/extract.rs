@@ -1,12 +1,10 @@
 use std::cmp::Ordering;
-use std::sync::Once;
 
-use opencv::core::{KeyPoint, Mat, Size, Vector, no_array};
-use opencv::features2d::SIFT;
-use opencv::prelude::*;
+use opencv::core::{Mat, Size};
 use serde::{Deserialize, Serialize};
 
 use crate::error::check;
+use crate::sift::{self, SiftParams, SiftPoint, detect_and_describe};
 use crate::{
     Camera, DESCRIPTOR_LEN, DESCRIPTOR_NORM, DecodedImage, FeatureError, ImageFeatures, Keypoint, Mask,
 };
@@ -18,7 +16,7 @@ pub struct FeatureParams {
     /// Most keypoints per image.
     pub max_features: usize,
     /// Longest side in pixels at which points are detected; larger images are reduced first. Detection of a
-    /// 4096 × 2048 panorama takes about 2 GB, in proportion to its pixels.
+    /// 4096 × 2048 panorama takes about 1 GB, in proportion to its pixels.
     pub max_side: u32,
     /// Least contrast of a keypoint, as OpenCV scales it; lower gives more and weaker points.
     pub contrast_threshold: f64,
@@ -39,7 +37,8 @@ impl FeatureParams {
     /// Changes whenever the same parameters and pixels give other features.
     ///
     /// 1: OpenCV SIFT, RootSIFT u8, half-pixel corrected, seam padded, spread over the sphere.
-    pub const VERSION: u32 = 1;
+    /// 2: own SIFT, bright and dark spots apart.
+    pub const VERSION: u32 = 2;
 
     /// Checks the ranges.
     ///
@@ -88,12 +87,6 @@ impl Default for FeatureParams {
 const SEAM_SHARE: usize = 24;
 /// Cells along the longer side of the grid that spreads keypoints.
 const CELLS: usize = 16;
-/// OpenCV enlarges the image twice by linear interpolation, which puts pixel x at 2x + ½, but halves coordinates as
-/// if it were at 2x: positions come out ¼ pixel too large. With the ½ between the conventions that leaves +¼.
-const CENTER_OFFSET: f32 = 0.5 - 0.25;
-
-static SINGLE_THREADED: Once = Once::new();
-
 /// Detects SIFT keypoints and describes them as RootSIFT.
 ///
 /// R. Arandjelović, A. Zisserman, "Three things everyone should know to improve object retrieval", CVPR 2012: the
@@ -105,7 +98,7 @@ static SINGLE_THREADED: Once = Once::new();
 /// [`FeatureParams::even_share`]) and come strongest first. A point with two orientations is two keypoints. `mask`
 /// pixels of 0 give no keypoints. An image without texture gives empty features.
 ///
-/// OpenCV is told once per process to use a single thread; callers work on several images in parallel.
+/// Single-threaded: callers work on several images in parallel.
 ///
 /// # Errors
 /// [`FeatureError::InvalidParameter`], [`FeatureError::InvalidCamera`], [`FeatureError::SizeMismatch`] if the camera
@@ -132,55 +125,61 @@ pub fn extract(
     let scale_x = width as f32 / grey.width as f32;
     let scale_y = height as f32 / grey.height as f32;
     let padding = if camera.wraps_around() { grey.width / SEAM_SHARE } else { 0 };
-    let (keypoints, descriptors) = detect(params, &grey.wrapped(padding))?;
-
-    let mut candidates: Vec<Candidate> = Vec::with_capacity(keypoints.len());
-    for (row, keypoint) in keypoints.iter().enumerate() {
-        let x = (keypoint.pt().x + CENTER_OFFSET - padding as f32) * scale_x;
-        let y = (keypoint.pt().y + CENTER_OFFSET) * scale_y;
+    let grey = grey.wrapped(padding);
+    let sift = SiftParams {
+        contrast_threshold: params.contrast_threshold,
+        edge_threshold: params.edge_threshold,
+        octave_layers: params.octave_layers as usize,
+        sigma_px: params.sigma_px,
+    };
+    let in_image = |x: f32, y: f32| ((x - padding as f32) * scale_x, y * scale_y);
+    let nadir = (params.nadir_cone_deg > 0.0 && camera.is_panoramic())
+        .then(|| params.nadir_cone_deg.to_radians().cos());
+    let allows = |x: f32, y: f32| {
+        let (x, y) = in_image(x, y);
         let inside = (0.0..width as f32).contains(&x) && (0.0..height as f32).contains(&y);
-        if !inside || mask.is_some_and(|mask| !mask.allows(x, y, width, height)) {
-            continue;
-        }
-        candidates.push(Candidate { row, x, y, response: keypoint.response() });
-    }
-    if params.nadir_cone_deg > 0.0 && camera.is_panoramic() {
-        let limit = params.nadir_cone_deg.to_radians().cos();
-        candidates.retain(|candidate| {
-            camera
-                .unproject(&nalgebra::Vector2::new(candidate.x.into(), candidate.y.into()))
-                .is_none_or(|ray| ray.y < limit)
+        let ray = || camera.unproject(&nalgebra::Vector2::new(x.into(), y.into()));
+        inside
+            && mask.is_none_or(|mask| mask.allows(x, y, width, height))
+            && nadir.is_none_or(|limit| ray().is_none_or(|ray| ray.y < limit))
+    };
+    let choose = |points: &[SiftPoint]| {
+        let candidate = |(index, point): (usize, &SiftPoint)| {
+            let (x, y) = in_image(point.x, point.y);
+            Candidate { index, x, y, response: point.response, is_light: point.is_light }
+        };
+        let mut candidates: Vec<Candidate> = points.iter().enumerate().map(candidate).collect();
+        // A total order, so that the choice does not depend on the detector's.
+        candidates.sort_by(|a, b| {
+            b.response
+                .total_cmp(&a.response)
+                .then(a.y.total_cmp(&b.y))
+                .then(a.x.total_cmp(&b.x))
+                .then(a.index.cmp(&b.index))
         });
-    }
-    // A total order, so that the choice does not depend on the detector's.
-    candidates.sort_by(|a, b| {
-        b.response
-            .total_cmp(&a.response)
-            .then(a.y.total_cmp(&b.y))
-            .then(a.x.total_cmp(&b.x))
-            .then(a.row.cmp(&b.row))
-    });
-    let chosen = choose(params, camera, &candidates);
-
+        let mut chosen = choose(params, camera, &candidates);
+        chosen.sort_by_key(|candidate| !candidate.is_light);
+        chosen.iter().map(|candidate| candidate.index).collect()
+    };
+    let (points, descriptors) = detect_and_describe(&sift, grey.view(), allows, choose);
     let mut features = ImageFeatures {
         width,
         height,
-        keypoints: Vec::with_capacity(chosen.len()),
-        descriptors: Vec::with_capacity(chosen.len() * DESCRIPTOR_LEN),
-        colors: Vec::with_capacity(chosen.len()),
+        light: points.iter().filter(|point| point.is_light).count() as u32,
+        keypoints: Vec::with_capacity(points.len()),
+        descriptors: Vec::with_capacity(points.len() * DESCRIPTOR_LEN),
+        colors: Vec::with_capacity(points.len()),
     };
-    for candidate in chosen {
-        let keypoint = keypoints.get(candidate.row).map_err(|error| detector_error(&error))?;
-        let descriptor =
-            descriptors.at_row::<f32>(candidate.row as i32).map_err(|error| detector_error(&error))?;
-        let at = (candidate.y as usize * width as usize + candidate.x as usize) * 3;
+    for (point, descriptor) in points.iter().zip(&descriptors) {
+        let (x, y) = in_image(point.x, point.y);
+        let at = (y as usize * width as usize + x as usize) * 3;
         features.colors.push([image.rgb[at], image.rgb[at + 1], image.rgb[at + 2]]);
         features.keypoints.push(Keypoint {
-            x: candidate.x,
-            y: candidate.y,
-            size: keypoint.size() * scale_x,
-            orientation: keypoint.angle().to_radians(),
-            noise_px: keypoint_noise_px(keypoint.size()) * scale_x,
+            x,
+            y,
+            size: point.size * scale_x,
+            orientation: point.orientation,
+            noise_px: keypoint_noise_px(point.size) * scale_x,
         });
         push_root_sift(descriptor, &mut features.descriptors);
     }
@@ -197,10 +196,11 @@ pub fn keypoint_noise_px(size: f32) -> f32 {
 }
 
 struct Candidate {
-    row: usize,
+    index: usize,
     x: f32,
     y: f32,
     response: f32,
+    is_light: bool,
 }
 
 /// A grey image for the detector.
@@ -241,6 +241,10 @@ impl Grey {
         Ok(Self { width, height, values })
     }
 
+    fn view(&self) -> sift::Grey<'_> {
+        sift::Grey { width: self.width, height: self.height, values: &self.values }
+    }
+
     /// With `padding` columns of the other side left and right.
     fn wrapped(self, padding: usize) -> Self {
         if padding == 0 {
@@ -254,26 +258,6 @@ impl Grey {
         }
         Self { width: self.width + 2 * padding, height: self.height, values }
     }
-}
-
-fn detect(params: &FeatureParams, grey: &Grey) -> Result<(Vector<KeyPoint>, Mat), FeatureError> {
-    let mut result = Ok(());
-    SINGLE_THREADED.call_once(|| result = opencv::core::set_num_threads(1));
-    result.map_err(|error| detector_error(&error))?;
-    let run = || -> opencv::Result<(Vector<KeyPoint>, Mat)> {
-        let image = Mat::new_rows_cols_with_data(grey.height as i32, grey.width as i32, &grey.values)?;
-        let mut sift = SIFT::create(
-            0,
-            params.octave_layers as i32,
-            params.contrast_threshold,
-            params.edge_threshold,
-            params.sigma_px,
-        )?;
-        let (mut keypoints, mut descriptors) = (Vector::new(), Mat::default());
-        sift.detect_and_compute(&image, &no_array(), &mut keypoints, &mut descriptors, false)?;
-        Ok((keypoints, descriptors))
-    };
-    run().map_err(|error| detector_error(&error))
 }
 
 fn detector_error(error: &opencv::Error) -> FeatureError {

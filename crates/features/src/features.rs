@@ -1,3 +1,5 @@
+use std::ops::Range;
+
 use nalgebra::{Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
@@ -39,8 +41,11 @@ pub struct ImageFeatures {
     pub width: u32,
     /// Image height in pixels, after EXIF orientation.
     pub height: u32,
-    /// The detected points.
+    /// The detected points: first those brighter than their surround, then those darker; in each part the strongest
+    /// first.
     pub keypoints: Vec<Keypoint>,
+    /// How many keypoints are brighter than their surround.
+    pub light: u32,
     /// Row-major descriptors, `keypoints.len() × DESCRIPTOR_LEN`.
     pub descriptors: Vec<u8>,
     /// sRGB colour of the image at each keypoint.
@@ -61,6 +66,17 @@ impl ImageFeatures {
     /// The descriptor of one keypoint.
     pub fn descriptor(&self, index: usize) -> &[u8] {
         &self.descriptors[index * DESCRIPTOR_LEN..(index + 1) * DESCRIPTOR_LEN]
+    }
+
+    /// The indices of the keypoints brighter than their surround, and of those darker.
+    pub fn parts(&self) -> [Range<usize>; 2] {
+        let light = (self.light as usize).min(self.len());
+        [0..light, light..self.len()]
+    }
+
+    /// The descriptors of some keypoints.
+    pub(crate) fn descriptors_of(&self, indices: &Range<usize>) -> &[u8] {
+        &self.descriptors[indices.start * DESCRIPTOR_LEN..indices.end * DESCRIPTOR_LEN]
     }
 
     /// The keypoints as rays of `camera`; `None` bearings never occur for keypoints that the camera can see.

@@ -47,6 +47,7 @@ mod extract;
 mod features;
 mod mask;
 mod matching;
+mod sift;
 
 pub use camera::{Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole, ProjectJacobian, UnprojectJacobian};
 pub use decode::{

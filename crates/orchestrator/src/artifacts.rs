@@ -12,14 +12,15 @@ use crate::serde_artifact;
 /// Features as raw blocks behind a short head: a gigabyte of descriptors is copied, not parsed.
 impl Artifact for ImageFeatures {
     const KIND: &'static str = "features";
-    const SCHEMA: u32 = 1;
+    const SCHEMA: u32 = 2;
 
     fn to_payload(&self) -> Result<Vec<u8>, CodecError> {
         let count = self.len();
-        let mut payload = Vec::with_capacity(16 + count * (size_of::<Keypoint>() + 131));
+        let mut payload = Vec::with_capacity(24 + count * (size_of::<Keypoint>() + 131));
         payload.extend_from_slice(&self.width.to_le_bytes());
         payload.extend_from_slice(&self.height.to_le_bytes());
         payload.extend_from_slice(&(count as u64).to_le_bytes());
+        payload.extend_from_slice(&u64::from(self.light).to_le_bytes());
         for keypoint in &self.keypoints {
             for value in [keypoint.x, keypoint.y, keypoint.size, keypoint.orientation, keypoint.noise_px] {
                 payload.extend_from_slice(&value.to_le_bytes());
@@ -32,10 +33,13 @@ impl Artifact for ImageFeatures {
 
     fn from_payload(payload: &[u8]) -> Result<Self, CodecError> {
         let wrong = || CodecError::Payload("feature blocks of a wrong length".to_owned());
-        let (head, rest) = payload.split_at_checked(16).ok_or_else(wrong)?;
+        let (head, rest) = payload.split_at_checked(24).ok_or_else(wrong)?;
         let number = |bytes: &[u8]| bytes.iter().rev().fold(0_u64, |sum, &byte| (sum << 8) | u64::from(byte));
-        let (width, height, count) =
-            (number(&head[..4]) as u32, number(&head[4..8]) as u32, number(&head[8..]) as usize);
+        let (width, height) = (number(&head[..4]) as u32, number(&head[4..8]) as u32);
+        let (count, light) = (number(&head[8..16]) as usize, number(&head[16..]) as u32);
+        if light as usize > count {
+            return Err(wrong());
+        }
         let (keypoints, rest) =
             count.checked_mul(20).and_then(|n| rest.split_at_checked(n)).ok_or_else(wrong)?;
         let (colors, descriptors) =
@@ -50,6 +54,7 @@ impl Artifact for ImageFeatures {
         Ok(Self {
             width,
             height,
+            light,
             keypoints: keypoints.chunks_exact(20).map(keypoint).collect(),
             descriptors: descriptors.to_vec(),
             colors: colors.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),

@@ -48,7 +48,8 @@ impl MatchParams {
     /// Changes whenever the same parameters and features give other matches.
     ///
     /// 1: exact two nearest neighbours, ratio and mutual test.
-    pub const VERSION: u32 = 1;
+    /// 2: bright and dark spots apart.
+    pub const VERSION: u32 = 2;
 
     /// Checks the ranges.
     ///
@@ -84,18 +85,31 @@ fn passes(nearest: &TwoNearest, ratio: f64, max_distance: f64) -> bool {
 
 /// Matches two images by exact two-nearest-neighbour search, ratio test and mutual test.
 ///
+/// Spots brighter than their surround are compared with such spots only, darker ones with darker ones.
 /// Distances are exact integers and ties go to the lower index, so the result is the same on every processor. With
 /// `mutual` both images' keypoints must pass the ratio test. Single-threaded: callers work on many pairs in parallel.
 /// Matches come in the order of the first image's keypoints.
 pub fn match_features(params: &MatchParams, first: &ImageFeatures, second: &ImageFeatures) -> Vec<Match> {
+    // A spot brighter than its surround never shows what a darker one does, so half the products suffice.
+    let mut matches = Vec::new();
+    for (first_part, second_part) in first.parts().into_iter().zip(second.parts()) {
+        let found =
+            match_parts(params, first.descriptors_of(&first_part), second.descriptors_of(&second_part));
+        let (first, second) = (first_part.start as u32, second_part.start as u32);
+        matches.extend(found.iter().map(|m| Match { first: m.first + first, second: m.second + second }));
+    }
+    matches
+}
+
+fn match_parts(params: &MatchParams, first: &[u8], second: &[u8]) -> Vec<Match> {
     if first.is_empty() || second.is_empty() {
         return Vec::new();
     }
     if !params.mutual {
-        let nearest = two_nearest(&first.descriptors, &second.descriptors);
+        let nearest = two_nearest(first, second);
         return collect(&nearest, |nearest| params.accepts(nearest), |_, _| true);
     }
-    let (forward, backward) = kernel::two_nearest_both(&first.descriptors, &second.descriptors);
+    let (forward, backward) = kernel::two_nearest_both(first, second);
     collect(
         &forward,
         |nearest| params.accepts(nearest),
@@ -183,6 +197,22 @@ mod tests {
             |mutual| match_features(&MatchParams { mutual, ..MatchParams::default() }, &first, &second);
         assert_eq!(with(true), [Match { first: 1, second: 0 }]);
         assert_eq!(with(false), [Match { first: 0, second: 0 }, Match { first: 1, second: 0 }]);
+    }
+
+    #[test]
+    fn bright_spots_never_match_dark_ones() {
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        let descriptors = random(&mut rng, 4);
+        let with = |light| ImageFeatures { light, ..features(descriptors.clone()) };
+        let matched = |first, second| {
+            let found = match_features(&MatchParams::default(), &with(first), &with(second));
+            found.iter().map(|m| (m.first, m.second)).collect::<Vec<_>>()
+        };
+        assert_eq!(matched(2, 2), [(0, 0), (1, 1), (2, 2), (3, 3)]);
+        assert_eq!(matched(0, 4), []);
+        let found = matched(3, 1);
+        assert!(found.contains(&(0, 0)) && found.contains(&(3, 3)));
+        assert!(found.iter().all(|(first, second)| (*first < 3) == (*second < 1)));
     }
 
     #[test]

@@ -117,8 +117,8 @@ fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, config: &Config) 
     if let Some((_, hash)) = &mask {
         external.insert("mask".to_owned(), *hash);
     }
-    // Decoded pixels, their grey float pyramid and the descriptors: about 24 bytes a pixel.
-    let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 24;
+    // Decoded pixels and six layers of the doubled image in floats, half of them with their smaller octaves.
+    let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 128;
     let params = json!({ "features": config.features, "camera": image.camera });
     let (path, hash, camera, features) =
         (image.path.clone(), image.hash, image.camera.clone(), config.features.clone());

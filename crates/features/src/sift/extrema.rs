@@ -1,0 +1,224 @@
+use nalgebra::{Matrix3, Vector3};
+
+use super::plane::Plane;
+use super::vectorized::{Level, vectorized};
+use super::{GREY_RANGE, SiftParams};
+
+/// Pixels along the border without keypoints.
+const BORDER: usize = 5;
+/// Most moves of the interpolation to a neighbouring pixel.
+const MAX_MOVES: usize = 5;
+/// Flags that are looked at together.
+const CHUNK: usize = 32;
+
+/// An extremum of the difference of Gaussians, in pixels of its octave.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Extremum {
+    /// Layer whose difference it is of, from 1 to the number of scales per octave.
+    pub layer: usize,
+    /// Its pixel.
+    pub column: usize,
+    pub row: usize,
+    /// Its place to a fraction of a pixel; the centre of the first pixel is 0.
+    pub x: f32,
+    pub y: f32,
+    /// Deviation of the Gaussian at its scale.
+    pub sigma: f32,
+    /// Contrast in [-1, 1]; positive for spots darker than their surround.
+    pub contrast: f32,
+}
+
+/// Rows of the differences and of their extremes over 3 × 3 pixels.
+#[derive(Debug, Default)]
+pub(super) struct ScanRows {
+    /// Three successive rows of each difference, row `y` in slot `y % 3`.
+    differences: Vec<[Vec<f32>; 3]>,
+    largest: Vec<Vec<f32>>,
+    smallest: Vec<Vec<f32>>,
+    column: Vec<f32>,
+    flags: Vec<u8>,
+}
+
+/// Finds and refines the extrema of one octave from its blurred layers.
+///
+/// D. G. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004, sections 3.1 and 4.
+pub(super) fn find_extrema(
+    level: Level,
+    params: &SiftParams,
+    layers: &[&Plane],
+    rows: &mut ScanRows,
+    found: &mut Vec<Extremum>,
+) {
+    let (width, height) = (layers[0].width, layers[0].height);
+    if width.min(height) <= 2 * BORDER {
+        return;
+    }
+    let num_differences = layers.len() - 1;
+    rows.differences.resize_with(num_differences, Default::default);
+    for row in rows.differences.iter_mut().flatten() {
+        row.resize(width, 0.0);
+    }
+    for target in [&mut rows.largest, &mut rows.smallest] {
+        target.resize_with(num_differences, Vec::new);
+        for row in target.iter_mut() {
+            row.resize(width, 0.0);
+        }
+    }
+    rows.column.resize(width, 0.0);
+    rows.flags.resize(width, 0);
+    // Half the contrast asked for, since interpolation raises it.
+    let threshold = (0.5 * params.contrast_threshold / params.octave_layers as f64) as f32 * GREY_RANGE;
+    for y in BORDER - 1..=BORDER {
+        subtract_row(level, layers, y, rows);
+    }
+    for y in BORDER..height - BORDER {
+        subtract_row(level, layers, y + 1, rows);
+        extremes_of_row(level, rows);
+        for layer in 1..num_differences - 1 {
+            flag_extrema(level, rows, layer, y % 3, threshold);
+            for (chunk, flags) in rows.flags.chunks(CHUNK).enumerate() {
+                if flags.iter().fold(0, |any, flag| any | flag) == 0 {
+                    continue;
+                }
+                for (lane, _) in flags.iter().enumerate().filter(|(_, flag)| **flag != 0) {
+                    let x = chunk * CHUNK + lane;
+                    if (BORDER..width - BORDER).contains(&x) {
+                        found.extend(refine(params, layers, layer, x, y));
+                    }
+                }
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// Puts row `y` of all differences into its slot.
+    fn subtract_row(layers: &[&Plane], y: usize, rows: &mut ScanRows) {
+        for (index, slots) in rows.differences.iter_mut().enumerate() {
+            let (finer, coarser) = (layers[index].row(y), layers[index + 1].row(y));
+            for ((target, &finer), &coarser) in slots[y % 3].iter_mut().zip(finer).zip(coarser) {
+                *target = coarser - finer;
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// The largest and the smallest of 3 × 3 pixels of each difference.
+    fn extremes_of_row(rows: &mut ScanRows) {
+        let width = rows.flags.len();
+        for (index, [a, b, c]) in rows.differences.iter().enumerate() {
+            let column = &mut rows.column[..width];
+            let (a, b, c) = (&a[..width], &b[..width], &c[..width]);
+            for x in 0..width {
+                column[x] = larger(larger(a[x], b[x]), c[x]);
+            }
+            let target = &mut rows.largest[index][1..width - 1];
+            for (x, target) in target.iter_mut().enumerate() {
+                *target = larger(larger(column[x], column[x + 1]), column[x + 2]);
+            }
+            for x in 0..width {
+                column[x] = smaller(smaller(a[x], b[x]), c[x]);
+            }
+            let target = &mut rows.smallest[index][1..width - 1];
+            for (x, target) in target.iter_mut().enumerate() {
+                *target = smaller(smaller(column[x], column[x + 1]), column[x + 2]);
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// Marks the pixels that no neighbour in place and scale exceeds.
+    fn flag_extrema(rows: &mut ScanRows, layer: usize, slot: usize, threshold: f32) {
+        let width = rows.flags.len();
+        let values = &rows.differences[layer][slot][..width];
+        let [l0, l1, l2] = [layer - 1, layer, layer + 1].map(|at| &rows.largest[at][..width]);
+        let [s0, s1, s2] = [layer - 1, layer, layer + 1].map(|at| &rows.smallest[at][..width]);
+        let flags = &mut rows.flags[..width];
+        for x in 0..width {
+            let value = values[x];
+            let largest = larger(larger(l0[x], l1[x]), l2[x]);
+            let smallest = smaller(smaller(s0[x], s1[x]), s2[x]);
+            let is_peak = u8::from(value > threshold) & u8::from(value >= largest);
+            let is_pit = u8::from(value < -threshold) & u8::from(value <= smallest);
+            flags[x] = is_peak | is_pit;
+        }
+    }
+}
+
+#[inline(always)]
+fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+#[inline(always)]
+fn smaller(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+/// Fits a quadratic to the 3 × 3 × 3 neighbours and moves to its extremum; `None` for what moves out, lacks contrast
+/// or lies on an edge.
+fn refine(params: &SiftParams, layers: &[&Plane], layer: usize, x: usize, y: usize) -> Option<Extremum> {
+    let (mut layer, mut x, mut y) = (layer, x, y);
+    let (width, height) = (layers[0].width, layers[0].height);
+    for _ in 0..MAX_MOVES {
+        let value = |dx: isize, dy: isize, ds: isize| {
+            let (x, y, layer) =
+                (x.wrapping_add_signed(dx), y.wrapping_add_signed(dy), layer.wrapping_add_signed(ds));
+            layers[layer + 1].at(x, y) - layers[layer].at(x, y)
+        };
+        let here = value(0, 0, 0);
+        let slope = |a: f32, b: f32| (b - a) * 0.5;
+        let gradient = Vector3::new(
+            slope(value(-1, 0, 0), value(1, 0, 0)),
+            slope(value(0, -1, 0), value(0, 1, 0)),
+            slope(value(0, 0, -1), value(0, 0, 1)),
+        );
+        let bend = |a: f32, b: f32| a + b - 2.0 * here;
+        let (xx, yy, ss) = (
+            bend(value(-1, 0, 0), value(1, 0, 0)),
+            bend(value(0, -1, 0), value(0, 1, 0)),
+            bend(value(0, 0, -1), value(0, 0, 1)),
+        );
+        let xy = (value(1, 1, 0) - value(-1, 1, 0) - value(1, -1, 0) + value(-1, -1, 0)) * 0.25;
+        let xs = (value(1, 0, 1) - value(-1, 0, 1) - value(1, 0, -1) + value(-1, 0, -1)) * 0.25;
+        let ys = (value(0, 1, 1) - value(0, -1, 1) - value(0, 1, -1) + value(0, -1, -1)) * 0.25;
+        let offset = -(Matrix3::new(xx, xy, xs, xy, yy, ys, xs, ys, ss).try_inverse()? * gradient);
+        if !offset.iter().all(|offset| offset.abs() < 1e6) {
+            return None;
+        }
+        if offset.iter().all(|offset| offset.abs() < 0.5) {
+            let contrast = (here + 0.5 * gradient.dot(&offset)) / GREY_RANGE;
+            if f64::from(contrast.abs()) * (params.octave_layers as f64) < params.contrast_threshold {
+                return None;
+            }
+            let (trace, determinant) = (xx + yy, xx * yy - xy * xy);
+            let edge = params.edge_threshold as f32;
+            if determinant <= 0.0 || trace * trace * edge >= (edge + 1.0) * (edge + 1.0) * determinant {
+                return None;
+            }
+            let scale = (layer as f32 + offset.z) / params.octave_layers as f32;
+            return Some(Extremum {
+                layer,
+                column: x,
+                row: y,
+                x: x as f32 + offset.x,
+                y: y as f32 + offset.y,
+                sigma: params.sigma_px as f32 * scale.exp2(),
+                contrast,
+            });
+        }
+        let moved = |at: usize, by: f32| at as isize + by.round() as isize;
+        let (new_x, new_y, new_layer) = (moved(x, offset.x), moved(y, offset.y), moved(layer, offset.z));
+        let within = |at: isize, low: usize, high: usize| (low as isize..high as isize).contains(&at);
+        if !within(new_layer, 1, params.octave_layers + 1)
+            || !within(new_x, BORDER, width - BORDER)
+            || !within(new_y, BORDER, height - BORDER)
+        {
+            return None;
+        }
+        (x, y, layer) = (new_x as usize, new_y as usize, new_layer as usize);
+    }
+    None
+}
