@@ -3,6 +3,8 @@ mod avx512;
 mod guided;
 mod kernel;
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, FeatureError, ImageFeatures};
@@ -42,13 +44,18 @@ pub struct MatchParams {
     pub mutual: bool,
     /// Largest distance of two descriptors as unit vectors, in (0, √2]: √2 is orthogonal, so no limit.
     pub max_distance: f64,
+    /// So many of the strongest bright and as many of the strongest dark keypoints of each image are matched first; 0
+    /// matches all at once. Images with less than twice as many are never screened.
+    pub screen_features: usize,
+    /// Least matches among those for which all keypoints are matched; with fewer, those matches are the result.
+    pub screen_matches: usize,
 }
 
 impl MatchParams {
     /// Changes whenever the same parameters and features give other matches.
     ///
     /// 1: exact two nearest neighbours, ratio and mutual test.
-    /// 2: bright and dark spots apart.
+    /// 2: bright and dark spots apart, screened by the strongest.
     pub const VERSION: u32 = 2;
 
     /// Checks the ranges.
@@ -69,7 +76,7 @@ impl MatchParams {
 
 impl Default for MatchParams {
     fn default() -> Self {
-        Self { ratio: 0.8, mutual: true, max_distance: 1.0 }
+        Self { ratio: 0.8, mutual: true, max_distance: 1.0, screen_features: 2048, screen_matches: 28 }
     }
 }
 
@@ -85,14 +92,37 @@ fn passes(nearest: &TwoNearest, ratio: f64, max_distance: f64) -> bool {
 
 /// Matches two images by exact two-nearest-neighbour search, ratio test and mutual test.
 ///
-/// Spots brighter than their surround are compared with such spots only, darker ones with darker ones.
+/// Spots brighter than their surround are compared with such spots only, darker ones with darker ones. Most pairs of a
+/// large set show different places; they are recognized by their strongest keypoints, which then match no more than
+/// by chance (about 20 of 4096), and spare the other fifteen sixteenths of the work.
 /// Distances are exact integers and ties go to the lower index, so the result is the same on every processor. With
 /// `mutual` both images' keypoints must pass the ratio test. Single-threaded: callers work on many pairs in parallel.
 /// Matches come in the order of the first image's keypoints.
 pub fn match_features(params: &MatchParams, first: &ImageFeatures, second: &ImageFeatures) -> Vec<Match> {
+    let parts = |features: &ImageFeatures, most: usize| {
+        features.parts().map(|part| part.start..part.end.min(part.start.saturating_add(most)))
+    };
+    let worth_screening = |features: &ImageFeatures| features.len() >= 4 * params.screen_features;
+    if params.screen_features > 0 && worth_screening(first) && worth_screening(second) {
+        let [first_parts, second_parts] =
+            [first, second].map(|features| parts(features, params.screen_features));
+        let found = match_all(params, (first, first_parts), (second, second_parts));
+        if found.len() < params.screen_matches {
+            return found;
+        }
+    }
+    match_all(params, (first, first.parts()), (second, second.parts()))
+}
+
+/// Matches some bright and some dark keypoints of two images.
+fn match_all(
+    params: &MatchParams,
+    (first, first_parts): (&ImageFeatures, [Range<usize>; 2]),
+    (second, second_parts): (&ImageFeatures, [Range<usize>; 2]),
+) -> Vec<Match> {
     // A spot brighter than its surround never shows what a darker one does, so half the products suffice.
     let mut matches = Vec::new();
-    for (first_part, second_part) in first.parts().into_iter().zip(second.parts()) {
+    for (first_part, second_part) in first_parts.into_iter().zip(second_parts) {
         let found =
             match_parts(params, first.descriptors_of(&first_part), second.descriptors_of(&second_part));
         let (first, second) = (first_part.start as u32, second_part.start as u32);
@@ -213,6 +243,20 @@ mod tests {
         let found = matched(3, 1);
         assert!(found.contains(&(0, 0)) && found.contains(&(3, 3)));
         assert!(found.iter().all(|(first, second)| (*first < 3) == (*second < 1)));
+    }
+
+    #[test]
+    fn images_whose_strongest_points_differ_are_not_matched_further() {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let (strong, weak) = (random(&mut rng, 50), random(&mut rng, 50));
+        let first = features([&strong[..], &weak].concat());
+        let same = features([&strong[..], &weak].concat());
+        let other = features([&random(&mut rng, 50)[..], &weak].concat());
+        let params = MatchParams { screen_features: 25, screen_matches: 10, ..MatchParams::default() };
+        assert_eq!(match_features(&params, &first, &same).len(), 100);
+        assert_eq!(match_features(&params, &first, &other).len(), 0);
+        let all = MatchParams { screen_features: 0, ..params };
+        assert_eq!(match_features(&all, &first, &other).len(), 50);
     }
 
     #[test]
