@@ -13,7 +13,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 
-use crate::error::Hinted;
+use crate::error::{Hinted, Interrupted};
 use crate::print;
 use args::{Cli, Command};
 
@@ -26,7 +26,10 @@ enum Answer {
     Negative,
 }
 
-/// Runs the program: exit code 0 done, 1 negative answer, 2 error.
+/// Exit code of a run that was stopped, as shells have it for SIGINT.
+pub const STOPPED: u8 = 130;
+
+/// Runs the program: exit code 0 done, 1 negative answer, 2 error, 130 stopped.
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
@@ -35,6 +38,10 @@ pub fn main() -> ExitCode {
     match dispatch(&cli.command) {
         Ok(Answer::Done) => ExitCode::SUCCESS,
         Ok(Answer::Negative) => ExitCode::from(1),
+        Err(error) if error.is::<Interrupted>() => {
+            print::note(&error.to_string());
+            ExitCode::from(STOPPED)
+        }
         Err(error) => {
             show(&error);
             ExitCode::from(2)

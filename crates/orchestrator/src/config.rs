@@ -82,6 +82,18 @@ impl Config {
         })
     }
 
+    /// The part that a scene depends on, as TOML: without localization.
+    ///
+    /// # Errors
+    /// When a value has no TOML form.
+    pub fn scene_toml(&self) -> Result<String> {
+        let mut table = toml::Table::try_from(self)?;
+        for localization in ["single", "camset"] {
+            table.remove(localization);
+        }
+        Ok(toml::to_string_pretty(&table)?)
+    }
+
     /// As TOML.
     ///
     /// # Errors

@@ -20,6 +20,7 @@ pub mod geodesy;
 pub mod graph;
 pub mod jobs;
 pub mod locating;
+pub mod manifest;
 pub mod print;
 pub mod scene;
 pub mod session;

@@ -305,6 +305,9 @@ pub enum CacheCommand {
         /// Also remove the oldest results until at most this is left
         #[arg(long, value_parser = parse_bytes)]
         max: Option<u64>,
+        /// Leave what is younger, in minutes: it may belong to a run that goes on
+        #[arg(long, value_name = "MINUTES", default_value_t = 60)]
+        min_age: u64,
     },
     /// Check every stored result; damaged ones are removed
     Verify,

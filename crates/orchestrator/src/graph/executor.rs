@@ -58,6 +58,18 @@ pub struct RunResult {
     pub keys: BTreeMap<String, ContentHash>,
 }
 
+impl RunResult {
+    /// Adds what a further graph of the same command came to.
+    pub fn absorb(&mut self, other: Self) {
+        self.ran.extend(other.ran);
+        self.ran.sort();
+        self.ran.dedup();
+        self.hits += other.hits;
+        self.failed.extend(other.failed);
+        self.keys.extend(other.keys);
+    }
+}
+
 #[derive(Clone)]
 struct Slot {
     state: State,
@@ -128,13 +140,18 @@ impl<'a> Executor<'a> {
         self.options.observer.notice(&Event::Planned { jobs });
         rayon::scope(|scope| self.pump(scope));
         self.options.observer.notice(&Event::Ended);
-        let mut shared = self.lock();
-        if let Some(error) = shared.fatal.take() {
+        if let Some(error) = self.lock().fatal.take() {
             return Err(error);
         }
         if self.options.stop.load(Ordering::Relaxed) {
             return Err(Interrupted.into());
         }
+        Ok(self.result())
+    }
+
+    /// What the jobs came to so far.
+    pub fn result(&self) -> RunResult {
+        let shared = self.lock();
         let mut result = RunResult::default();
         for id in self.graph.graph.node_indices() {
             let (slot, label) = (&shared.slots[id.index()], self.graph.job(id).label());
@@ -149,7 +166,7 @@ impl<'a> Executor<'a> {
             }
         }
         result.ran.sort();
-        Ok(result)
+        result
     }
 
     /// Starts as many ready jobs as threads and memory allow, in the order they were added.
@@ -339,7 +356,11 @@ impl<'a> Executor<'a> {
         self.options.observer.notice(&Event::Warning { text });
         self.options.store.discard(output);
         let product: Product = (self.graph.job(id).work)(&Inputs { executor: self, id })?;
-        let again = self.options.store.write(&self.fingerprint(id), &product.file, 0.0)?;
+        if let Err(error) = self.options.store.write(&self.fingerprint(id), &product.file, 0.0) {
+            let text = format!("{label} was made again but cannot be kept: {error:#}");
+            self.options.observer.notice(&Event::Warning { text });
+        }
+        let again = ContentHash::of(&product.file);
         anyhow::ensure!(again == output, "{label} gives another result than before: run the command again");
         let slot = &mut self.lock().slots[id.index()];
         slot.state = State::Ran;
