@@ -315,6 +315,19 @@ impl Store {
     }
 }
 
+/// What is younger may be in the hands of another process.
+const LEFTOVER_AGE: Duration = Duration::from_hours(1);
+
+/// Removes what killed processes left half written in an output folder, as far as it can.
+pub fn remove_leftovers(folder: &Path) {
+    for path in temporary_files_below(folder).unwrap_or_default() {
+        let age = fs::metadata(&path).and_then(|metadata| metadata.modified()).map(|at| at.elapsed());
+        if matches!(age, Ok(Ok(age)) if age >= LEFTOVER_AGE) {
+            let _ = fs::remove_file(&path);
+        }
+    }
+}
+
 /// Removes a file; that another process did it before is no error.
 fn remove(path: &Path) -> Result<()> {
     match fs::remove_file(path) {
@@ -390,7 +403,8 @@ const TEMPORARY: &str = ".writing-";
 fn files_below(folder: &Path) -> Result<Vec<PathBuf>> {
     let shards = entries(folder)?.into_iter().filter(|path| path.is_dir());
     let mut files = shards.map(|shard| entries(&shard)).collect::<Result<Vec<_>>>()?.concat();
-    files.retain(|path| !is_temporary(path));
+    // Others than ours, too, hide what they have not finished (as NFS and editors do).
+    files.retain(|path| name_starts_with(path, ".") == Some(false));
     Ok(files)
 }
 
@@ -400,12 +414,12 @@ fn temporary_files_below(folder: &Path) -> Result<Vec<PathBuf>> {
     for path in entries(folder)? {
         if path.is_dir() { files.extend(entries(&path)?) } else { files.push(path) }
     }
-    files.retain(|path| is_temporary(path));
+    files.retain(|path| name_starts_with(path, TEMPORARY) == Some(true));
     Ok(files)
 }
 
-fn is_temporary(path: &Path) -> bool {
-    path.file_name().and_then(|name| name.to_str()).is_none_or(|name| name.starts_with('.'))
+fn name_starts_with(path: &Path, prefix: &str) -> Option<bool> {
+    Some(path.file_name()?.to_str()?.starts_with(prefix))
 }
 
 /// The paths in a folder, sorted; a missing folder is empty.

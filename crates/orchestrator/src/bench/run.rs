@@ -30,7 +30,8 @@ pub struct BenchOptions {
 }
 
 /// Positions given to the scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum BenchGps {
     /// None.
     #[default]

@@ -1,8 +1,6 @@
 //! What can be typed.
 
-use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -75,17 +73,7 @@ impl RunArgs {
     }
 
     /// Opens the store; the log is a file in `log_folder`.
-    pub fn session(&self, output: &std::path::Path, log_folder: Option<&std::path::Path>) -> Result<Session> {
-        self.session_with(output, log_folder, &stop_on_signal())
-    }
-
-    /// As [`Self::session`], with a flag that exists already.
-    pub fn session_with(
-        &self,
-        output: &std::path::Path,
-        log_folder: Option<&std::path::Path>,
-        stop: &Arc<AtomicBool>,
-    ) -> Result<Session> {
+    pub fn session(&self, output: &Path, log_folder: Option<&Path>) -> Result<Session> {
         let threads =
             self.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
         let threads = threads.max(1);
@@ -97,9 +85,10 @@ impl RunArgs {
         };
         if let Some(folder) = log_folder {
             crate::store::create_folder(folder)?;
+            crate::store::remove_leftovers(folder);
         }
         let log = log_folder.map(|folder| folder.join("run.jsonl"));
-        Session::open(&cache_folder(self.cache.as_deref(), output), log.as_deref(), limits, Arc::clone(stop))
+        Session::open(&cache_folder(self.cache.as_deref(), output), log.as_deref(), limits, stop_on_signal())
     }
 }
 
@@ -206,18 +195,44 @@ pub struct LocateArgs {
 /// `setloc bench`
 #[derive(Debug, Clone, Args)]
 pub struct BenchArgs {
-    /// Data sets
-    #[arg(required = true)]
+    /// Data sets [default: those of the registry]
     pub datasets: Vec<PathBuf>,
     /// Folder for the results
     #[arg(short, long, default_value = "out")]
     pub output: PathBuf,
-    /// Positions given to the scene
+    /// Positions given to the scene; the registry has its own for each data set
     #[arg(long, value_enum, default_value_t)]
     pub gps: BenchGps,
+    /// Runs with as many seeds, from --seed on
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub repeats: u64,
+    /// What is registered and how
+    #[command(flatten)]
+    pub registry: RegistryArgs,
     /// Options of the run; without --cache nothing is reused, so that times are those of the whole work
     #[command(flatten)]
     pub run: RunArgs,
+}
+
+/// The registry of data sets, used when no data set is named.
+#[derive(Debug, Clone, Args)]
+#[command(next_help_heading = "Registry")]
+pub struct RegistryArgs {
+    /// Data sets and parameter sets (TOML)
+    #[arg(long, value_name = "FILE", default_value = "benchmarks/datasets.toml")]
+    pub registry: PathBuf,
+    /// Folder that the registry's paths are relative to [default: the registry's own]
+    #[arg(long, value_name = "DIR", env = "SETLOC_DATA")]
+    pub data: Option<PathBuf>,
+    /// Only these of the registered data sets
+    #[arg(long, value_name = "NAME", num_args = 1.., conflicts_with = "datasets")]
+    pub only: Vec<String>,
+    /// Figures to compare with [default: baseline.json beside the registry]
+    #[arg(long, value_name = "FILE", conflicts_with = "datasets")]
+    pub baseline: Option<PathBuf>,
+    /// Put the figures of this run into the baseline
+    #[arg(long, conflicts_with = "datasets")]
+    pub update_baseline: bool,
 }
 
 /// `setloc batch`

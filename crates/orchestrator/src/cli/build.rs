@@ -1,6 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use serde_json::Value;
 use setloc_features::ImageFeatures;
 use setloc_sfm::Reconstruction;
 
@@ -35,7 +36,8 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     let session = args.source.run.session(output, Some(&export))?;
     let name = session.store.name_of("build", output);
     let present = std::fs::read(output).ok().map(|bytes| ContentHash::of(&bytes));
-    let present = present.filter(|_| export.join("report.json").is_file());
+    // The report is written last: exports of another scene, as a killed run leaves them, are none of this one.
+    let present = present.filter(|hash| reported_scene(&export) == Some(*hash));
     let outcome = build_scene(&session, &folder, &config, args.source.run.seed, &name, present)?;
     let (run, skipped) = match &outcome {
         BuildOutcome::Unchanged(run, skipped) => {
@@ -90,6 +92,12 @@ pub fn plan(args: &PlanArgs) -> Result<Answer> {
         (count(Prediction::Runs), count(Prediction::Follows), count(Prediction::Stored));
     print::data(&format!("{runs} jobs run, {follows} depend on them, {stored} are stored"));
     Ok(Answer::Done)
+}
+
+/// The scene whose exports are in a folder.
+fn reported_scene(folder: &Path) -> Option<ContentHash> {
+    let report: Value = serde_json::from_slice(&std::fs::read(folder.join("report.json")).ok()?).ok()?;
+    serde_json::from_value(report["scene"].clone()).ok()
 }
 
 fn read_sources(source: &SourceArgs) -> Result<ImageFolder> {

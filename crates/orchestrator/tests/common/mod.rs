@@ -47,7 +47,7 @@ pub fn town(folder: &Path) -> PathBuf {
 /// The program, to be run in a folder.
 pub fn program(folder: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_setloc"));
-    command.current_dir(folder).env_remove("SETLOC_CACHE").args(arguments);
+    command.current_dir(folder).env_remove("SETLOC_CACHE").env_remove("SETLOC_DATA").args(arguments);
     command
 }
 
