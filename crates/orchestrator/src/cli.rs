@@ -8,7 +8,10 @@ mod cache;
 mod demo;
 mod export;
 mod locate;
+mod report;
+mod status;
 
+use std::io::{self, ErrorKind};
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -57,6 +60,8 @@ fn dispatch(command: &Command) -> anyhow::Result<Answer> {
         Command::Locate(args) => locate::run(args),
         Command::Bench(args) => bench::run(args),
         Command::Batch(args) => batch::run(args),
+        Command::Report(args) => report::run(args),
+        Command::Status(args) => status::run(args),
         Command::Export(args) => export::run(args),
         Command::Explain(args) => cache::explain(args),
         Command::Cache(args) => cache::run(args),
@@ -73,7 +78,16 @@ fn show(error: &anyhow::Error) {
         }
         last = text;
     }
-    for hint in error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()) {
-        print::note(&format!("hint: {}", hint.hint()));
+    let hints: Vec<&str> =
+        error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()).map(Hinted::hint).collect();
+    for hint in &hints {
+        print::note(&format!("hint: {hint}"));
+    }
+    let is_missing = |cause: &(dyn std::error::Error + 'static)| {
+        cause.downcast_ref::<io::Error>().is_some_and(|error| error.kind() == ErrorKind::NotFound)
+    };
+    if hints.is_empty() && error.chain().any(is_missing) {
+        let here = std::env::current_dir().unwrap_or_default();
+        print::note(&format!("hint: check the path; a relative one starts in {}", here.display()));
     }
 }

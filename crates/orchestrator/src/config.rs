@@ -66,8 +66,11 @@ impl Config {
                 let text = std::fs::read_to_string(path)
                     .with_context(|| format!("cannot read {}", path.display()))?;
                 // Checked on its own first, so that the error shows the line in the file.
-                toml::from_str::<Self>(&text)
-                    .with_context(|| format!("{} is not a valid configuration", path.display()))?;
+                toml::from_str::<Self>(&text).map_err(|error| {
+                    let error = anyhow::Error::new(error)
+                        .context(format!("{} is not a valid configuration", path.display()));
+                    Hinted::wrap(error, "`setloc build --print-config` lists all keys with their values")
+                })?;
                 toml::from_str::<toml::Table>(&text)?
             }
             None => toml::Table::new(),

@@ -13,6 +13,7 @@ pub mod clock;
 pub mod codec;
 pub mod config;
 pub mod dataset;
+pub mod digest;
 pub mod error;
 pub mod export;
 pub mod fingerprint;

@@ -35,6 +35,10 @@ pub enum Command {
     Bench(BenchArgs),
     /// Build many scenes and locate many sets, from a manifest
     Batch(BatchArgs),
+    /// Show what a build or a localization came to, as text and as a page
+    Report(ReportArgs),
+    /// Show what is stored and what the last runs did
+    Status(StatusArgs),
     /// Write a scene in another format
     Export(ExportArgs),
     /// Say what changed for a job or image between the last two runs
@@ -206,12 +210,12 @@ pub struct BenchArgs {
     /// Runs with as many seeds, from --seed on
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub repeats: u64,
-    /// What is registered and how
-    #[command(flatten)]
-    pub registry: RegistryArgs,
     /// Options of the run; without --cache nothing is reused, so that times are those of the whole work
     #[command(flatten)]
     pub run: RunArgs,
+    /// What is registered and how
+    #[command(flatten)]
+    pub registry: RegistryArgs,
 }
 
 /// The registry of data sets, used when no data set is named.
@@ -287,6 +291,24 @@ pub enum ExportFormat {
     Json,
     /// Picture from above (PNG)
     TopView,
+}
+
+/// `setloc report`
+#[derive(Debug, Clone, Args)]
+pub struct ReportArgs {
+    /// Results of `build` (the scene file or the folder beside it) or of `locate` (its folder)
+    pub results: PathBuf,
+    /// The page to write [default: report.html in the folder]
+    #[arg(short, long, value_name = "FILE")]
+    pub output: Option<PathBuf>,
+}
+
+/// `setloc status`
+#[derive(Debug, Clone, Args)]
+pub struct StatusArgs {
+    /// Folder of stored results
+    #[arg(long, value_name = "DIR", env = "SETLOC_CACHE", default_value = ".setloc-cache")]
+    pub cache: PathBuf,
 }
 
 /// `setloc explain`

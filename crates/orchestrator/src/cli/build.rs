@@ -112,7 +112,7 @@ fn read_sources(source: &SourceArgs) -> Result<ImageFolder> {
 }
 
 /// The scene file's name without its ending, or with `-export` when it has none.
-fn export_folder(output: &Path) -> PathBuf {
+pub fn export_folder(output: &Path) -> PathBuf {
     let folder = output.with_extension("");
     if folder == output { PathBuf::from(format!("{}-export", output.display())) } else { folder }
 }
