@@ -16,7 +16,7 @@ use setloc_orchestrator::jobs::LocateJobs;
 use setloc_orchestrator::locating::{Mode, locate};
 use setloc_orchestrator::session::{Limits, Session};
 
-use common::{files_below, logged, panoramas, town, write_picture};
+use common::{files_below, logged, panoramas, program, said, setloc, town, write_picture};
 
 fn build(store: &Path, panoramas: &Path, config: &Config) -> Box<Built> {
     let limits = Limits { threads: 2, memory: 1 << 30 };
@@ -205,7 +205,7 @@ fn a_moved_store_is_as_good_as_before() {
 #[test]
 fn every_damaged_file_of_the_store_is_made_again() {
     let folder = tempfile::tempdir().unwrap();
-    let (images, store) = (panoramas(folder.path(), 3), folder.path().join("store"));
+    let (images, store) = (town(folder.path()).join("panoramas"), folder.path().join("store"));
     let first = build(&store, &images, &Config::default());
     for path in files_below(&store.join("objects")).into_iter().chain(files_below(&store.join("keys"))) {
         let whole = std::fs::read(&path).unwrap();
@@ -223,12 +223,23 @@ fn every_damaged_file_of_the_store_is_made_again() {
 #[test]
 fn two_builds_at_once_on_one_store_are_both_right() {
     let folder = tempfile::tempdir().unwrap();
-    let (images, store) = (panoramas(folder.path(), 4), folder.path().join("store"));
-    let hashes = std::thread::scope(|scope| {
-        let runs: Vec<_> =
-            (0..2).map(|_| scope.spawn(|| build(&store, &images, &Config::default()).hash)).collect();
-        runs.into_iter().map(|run| run.join().unwrap()).collect::<Vec<_>>()
-    });
-    assert_eq!(hashes[0], hashes[1]);
-    assert!(build(&store, &images, &Config::default()).run.ran.is_empty());
+    town(folder.path());
+    let build = |output: &str| {
+        let arguments = ["build", "town/panoramas", "--cache", "store", "-o", output];
+        let mut command = program(folder.path(), &arguments);
+        command.stderr(std::process::Stdio::null()).spawn().unwrap()
+    };
+    for mut run in ["a.setloc", "b.setloc"].map(build) {
+        assert_eq!(run.wait().unwrap().code(), Some(0));
+    }
+    let read = |name: &str| std::fs::read(folder.path().join(name)).unwrap();
+    assert!(read("a.setloc") == read("b.setloc"));
+    let verified = setloc(folder.path(), &["cache", "verify", "--cache", "store"]);
+    assert_eq!(verified.status.code(), Some(0));
+    let again = setloc(folder.path(), &["build", "town/panoramas", "--cache", "store", "-o", "c.setloc"]);
+    assert!(
+        said(&again).contains("\n0 jobs ran") && read("c.setloc") == read("a.setloc"),
+        "{}",
+        said(&again)
+    );
 }

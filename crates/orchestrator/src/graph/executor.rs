@@ -373,3 +373,112 @@ impl<'a> Executor<'a> {
         self.shared.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::graph::{Broadcast, Job};
+    use crate::serde_artifact;
+
+    #[derive(serde::Serialize, serde::Deserialize)]
+    struct Number(u32);
+    serde_artifact!(Number, "number", 1);
+
+    type Work<'a> = &'a (dyn Fn() -> Result<Product> + Send + Sync);
+
+    fn job<'a>(name: &str, memory: u64, work: Work<'a>) -> Job<'a> {
+        Job {
+            kind: "test",
+            version: 1,
+            name: name.to_owned(),
+            params: json!(name),
+            external: BTreeMap::new(),
+            memory,
+            work: Box::new(move |_| work()),
+        }
+    }
+
+    fn run(graph: &JobGraph<'_>, store: &Store, stop: &AtomicBool) -> Result<RunResult> {
+        let observer = Broadcast::default();
+        let options = RunOptions { store, observer: &observer, threads: 4, memory: 100, stop };
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
+        pool.install(|| Executor::new(graph, &options).run())
+    }
+
+    fn store() -> (tempfile::TempDir, Store) {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).unwrap();
+        (folder, store)
+    }
+
+    #[test]
+    fn jobs_wait_for_memory_but_one_that_exceeds_it_runs_alone() {
+        let (_folder, store) = store();
+        let (used, most) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        let hold = |memory: usize| {
+            let now = used.fetch_add(memory, Ordering::SeqCst) + memory;
+            most.fetch_max(now, Ordering::SeqCst);
+            std::thread::sleep(std::time::Duration::from_millis(5));
+            used.fetch_sub(memory, Ordering::SeqCst);
+            Product::new(Number(0))
+        };
+        let (middle, large) = (|| hold(45), || hold(300));
+        let mut graph = JobGraph::default();
+        for at in 0..6 {
+            graph.add(job(&format!("middle {at}"), 45, &middle));
+        }
+        assert_eq!(run(&graph, &store, &AtomicBool::new(false)).unwrap().ran.len(), 6);
+        assert!(most.load(Ordering::SeqCst) <= 90, "{most:?}");
+        graph.add(job("large", 300, &large));
+        for at in 6..12 {
+            graph.add(job(&format!("middle {at}"), 45, &middle));
+        }
+        let again = run(&graph, &store, &AtomicBool::new(false)).unwrap();
+        assert_eq!((again.ran.len(), again.hits), (7, 6));
+        assert_eq!(most.load(Ordering::SeqCst), 300);
+    }
+
+    #[test]
+    fn a_failing_or_panicking_job_takes_along_only_those_that_require_it() {
+        let (_folder, store) = store();
+        let fails = || Err(anyhow::anyhow!("no light"));
+        let panics = || panic!("a bug");
+        let works = || Product::new(Number(1));
+        let mut graph = JobGraph::default();
+        let (bad, worse, good) = (
+            graph.add(job("bad", 1, &fails)),
+            graph.add(job("worse", 1, &panics)),
+            graph.add(job("good", 1, &works)),
+        );
+        let user = graph.add(job("requires bad", 1, &works));
+        graph.require(user, "a", bad);
+        let tolerant = graph.add(job("accepts worse", 1, &works));
+        graph.accept(tolerant, "a", worse);
+        graph.require(tolerant, "b", good);
+        let result = run(&graph, &store, &AtomicBool::new(false)).unwrap();
+        assert_eq!(result.ran, ["test accepts worse", "test good"]);
+        assert_eq!(result.failed["test bad"], "no light");
+        assert!(result.failed["test worse"].contains("panicked"), "{:?}", result.failed);
+        assert_eq!(result.keys.len(), 2);
+    }
+
+    #[test]
+    fn a_stop_lets_running_jobs_finish_and_starts_no_other() {
+        let (_folder, store) = store();
+        let stop = AtomicBool::new(false);
+        let stops = || {
+            stop.store(true, Ordering::Relaxed);
+            Product::new(Number(1))
+        };
+        let never = || panic!("it must not be started");
+        let mut graph = JobGraph::default();
+        let first = graph.add(job("first", 1, &stops));
+        let second = graph.add(job("second", 1, &never));
+        graph.require(second, "a", first);
+        assert!(run(&graph, &store, &stop).unwrap_err().is::<Interrupted>());
+        let again = graph.plan(&store, &crate::store::RunRecord::default());
+        assert_eq!(again[0].prediction, crate::graph::Prediction::Stored);
+    }
+}
