@@ -7,6 +7,7 @@ mod build;
 mod cache;
 mod demo;
 mod export;
+mod import;
 mod locate;
 mod report;
 mod status;
@@ -63,6 +64,7 @@ fn dispatch(command: &Command) -> anyhow::Result<Answer> {
         Command::Report(args) => report::run(args),
         Command::Status(args) => status::run(args),
         Command::Export(args) => export::run(args),
+        Command::Import(args) => import::run(args),
         Command::Explain(args) => cache::explain(args),
         Command::Cache(args) => cache::run(args),
     }

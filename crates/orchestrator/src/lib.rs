@@ -20,6 +20,7 @@ pub mod fingerprint;
 pub mod geodesy;
 pub mod graph;
 pub mod html;
+pub mod import;
 pub mod jobs;
 pub mod locating;
 pub mod manifest;

@@ -10,8 +10,8 @@ use common::{gave, panoramas, said, setloc, town};
 fn help_says_what_there_is() {
     let folder = tempfile::tempdir().unwrap();
     let commands = [
-        "", "demo", "build", "plan", "locate", "bench", "batch", "report", "status", "export", "explain",
-        "cache", "cache gc",
+        "", "demo", "build", "plan", "locate", "bench", "batch", "report", "status", "export", "import",
+        "explain", "cache", "cache gc",
     ];
     for command in commands {
         let arguments: Vec<&str> = command.split_whitespace().chain(["--help"]).collect();
@@ -91,4 +91,39 @@ fn report_and_status_tell_what_came_out() {
         status.contains("jobs ran, 0 were stored, 0 failed") && status.contains("features\t8"),
         "{status}"
     );
+}
+
+#[test]
+fn plan_and_explain_name_the_parameter_that_changed() {
+    let folder = tempfile::tempdir().unwrap();
+    town(folder.path());
+    let run = |command: &[&str], settings: &[&str]| {
+        let output = setloc(folder.path(), &[command, settings].concat());
+        assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+        gave(&output)
+    };
+    let (plan, build) =
+        (["plan", "town/panoramas", "-o", "s.setloc"], ["build", "town/panoramas", "-o", "s.setloc"]);
+    assert!(run(&plan, &[]).contains("runs     features panoramas/pano_000.jpg: never ran before"));
+    assert!(!folder.path().join(".setloc-cache").exists(), "a plan makes nothing");
+    run(&build, &[]);
+    assert!(run(&plan, &[]).ends_with("0 jobs run, 0 depend on them, 19 are stored\n"));
+    let changed = ["--set", "two_view.min_inliers=40"];
+    let reason = "parameter two_view.min_inliers changed from ";
+    let planned = run(&plan, &changed);
+    assert_eq!(
+        planned.lines().filter(|line| line.starts_with("runs     verify ") && line.contains(reason)).count(),
+        6
+    );
+    assert!(planned.contains("follows  model scene: uses verify "), "{planned}");
+    run(&build, &changed);
+    let explained = run(&["explain", "verify panoramas/pano_000.jpg"], &[]);
+    assert!(
+        explained.lines().count() == 3 && explained.lines().all(|line| line.contains(reason)),
+        "{explained}"
+    );
+    assert!(run(&["explain", "features"], &[]).lines().all(|line| line.ends_with(": nothing changed")));
+    // Another output in the same store is another run.
+    run(&["build", "town/panoramas", "-o", "other/s.setloc"], &["--cache", ".setloc-cache"]);
+    assert!(run(&["explain", "features"], &[]).contains("build other/s.setloc: features"));
 }

@@ -41,6 +41,8 @@ pub enum Command {
     Status(StatusArgs),
     /// Write a scene in another format
     Export(ExportArgs),
+    /// Make cameras.json and truth.json of a COLMAP text model
+    Import(ImportArgs),
     /// Say what changed for a job or image between the last two runs
     Explain(ExplainArgs),
     /// Look after the store of results
@@ -309,6 +311,19 @@ pub struct StatusArgs {
     /// Folder of stored results
     #[arg(long, value_name = "DIR", env = "SETLOC_CACHE", default_value = ".setloc-cache")]
     pub cache: PathBuf,
+}
+
+/// `setloc import`
+#[derive(Debug, Clone, Args)]
+pub struct ImportArgs {
+    /// Folder with cameras.txt and images.txt
+    pub model: PathBuf,
+    /// Folder for cameras.json (for --cameras) and truth.json (for `bench`)
+    #[arg(short, long, default_value = "out")]
+    pub output: PathBuf,
+    /// Put before the images' names, as `panoramas/`
+    #[arg(long, default_value = "")]
+    pub prefix: String,
 }
 
 /// `setloc explain`
