@@ -51,8 +51,8 @@ pub fn build_scene(
 ) -> Result<BuildOutcome> {
     let mut graph = JobGraph::default();
     let jobs = add_scene(&mut graph, &folder.images, config, seed)?;
-    session.run(&graph, |executor, run| {
-        session.remember(name, run.keys.clone())?;
+    session.run(name, &graph, |executor, run| {
+        session.remember(name, run)?;
         let mut skipped = folder.skipped.clone();
         for (image, job) in folder.images.iter().zip(&jobs.model.features) {
             if let Some(reason) = run.failed.get(&graph.job(*job).label()) {

@@ -7,13 +7,17 @@ mod build;
 mod cache;
 mod demo;
 mod export;
+mod import;
 mod locate;
+mod report;
+mod status;
 
+use std::io::{self, ErrorKind};
 use std::process::ExitCode;
 
 use clap::Parser;
 
-use crate::error::Hinted;
+use crate::error::{Hinted, Interrupted};
 use crate::print;
 use args::{Cli, Command};
 
@@ -26,7 +30,10 @@ enum Answer {
     Negative,
 }
 
-/// Runs the program: exit code 0 done, 1 negative answer, 2 error.
+/// Exit code of a run that was stopped, as shells have it for SIGINT.
+pub const STOPPED: u8 = 130;
+
+/// Runs the program: exit code 0 done, 1 negative answer, 2 error, 130 stopped.
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
@@ -35,6 +42,10 @@ pub fn main() -> ExitCode {
     match dispatch(&cli.command) {
         Ok(Answer::Done) => ExitCode::SUCCESS,
         Ok(Answer::Negative) => ExitCode::from(1),
+        Err(error) if error.is::<Interrupted>() => {
+            print::note(&error.to_string());
+            ExitCode::from(STOPPED)
+        }
         Err(error) => {
             show(&error);
             ExitCode::from(2)
@@ -50,7 +61,10 @@ fn dispatch(command: &Command) -> anyhow::Result<Answer> {
         Command::Locate(args) => locate::run(args),
         Command::Bench(args) => bench::run(args),
         Command::Batch(args) => batch::run(args),
+        Command::Report(args) => report::run(args),
+        Command::Status(args) => status::run(args),
         Command::Export(args) => export::run(args),
+        Command::Import(args) => import::run(args),
         Command::Explain(args) => cache::explain(args),
         Command::Cache(args) => cache::run(args),
     }
@@ -66,7 +80,16 @@ fn show(error: &anyhow::Error) {
         }
         last = text;
     }
-    for hint in error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()) {
-        print::note(&format!("hint: {}", hint.hint()));
+    let hints: Vec<&str> =
+        error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()).map(Hinted::hint).collect();
+    for hint in &hints {
+        print::note(&format!("hint: {hint}"));
+    }
+    let is_missing = |cause: &(dyn std::error::Error + 'static)| {
+        cause.downcast_ref::<io::Error>().is_some_and(|error| error.kind() == ErrorKind::NotFound)
+    };
+    if hints.is_empty() && error.chain().any(is_missing) {
+        let here = std::env::current_dir().unwrap_or_default();
+        print::note(&format!("hint: check the path; a relative one starts in {}", here.display()));
     }
 }

@@ -1,5 +1,10 @@
 //! CPU time and memory as the operating system counts them.
 
+/// Seconds since 1970; 0 on a clock that is set before.
+pub fn unix_secs() -> u64 {
+    std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |since| since.as_secs())
+}
+
 /// CPU seconds of the calling thread.
 pub fn thread_cpu_secs() -> f64 {
     clock_secs(libc::CLOCK_THREAD_CPUTIME_ID)

@@ -66,8 +66,11 @@ impl Config {
                 let text = std::fs::read_to_string(path)
                     .with_context(|| format!("cannot read {}", path.display()))?;
                 // Checked on its own first, so that the error shows the line in the file.
-                toml::from_str::<Self>(&text)
-                    .with_context(|| format!("{} is not a valid configuration", path.display()))?;
+                toml::from_str::<Self>(&text).map_err(|error| {
+                    let error = anyhow::Error::new(error)
+                        .context(format!("{} is not a valid configuration", path.display()));
+                    Hinted::wrap(error, "`setloc build --print-config` lists all keys with their values")
+                })?;
                 toml::from_str::<toml::Table>(&text)?
             }
             None => toml::Table::new(),
@@ -80,6 +83,18 @@ impl Config {
             let message = format!("invalid setting: {}", error.message());
             Hinted::error(message, "`setloc build --print-config` lists all keys with their values")
         })
+    }
+
+    /// The part that a scene depends on, as TOML: without localization.
+    ///
+    /// # Errors
+    /// When a value has no TOML form.
+    pub fn scene_toml(&self) -> Result<String> {
+        let mut table = toml::Table::try_from(self)?;
+        for localization in ["single", "camset"] {
+            table.remove(localization);
+        }
+        Ok(toml::to_string_pretty(&table)?)
     }
 
     /// As TOML.

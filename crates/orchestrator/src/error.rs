@@ -1,6 +1,7 @@
 //! Errors that say what to try next.
 
 use std::fmt;
+use std::io::{self, ErrorKind};
 
 /// An error with the next thing to try.
 #[derive(Debug)]
@@ -39,6 +40,16 @@ impl std::error::Error for Hinted {
     fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
         self.error.source()
     }
+}
+
+/// Whether an error will meet every other job too: the disk is full or cannot be written.
+pub fn concerns_the_disk(error: &anyhow::Error) -> bool {
+    error.chain().filter_map(|cause| cause.downcast_ref::<io::Error>()).any(|cause| {
+        matches!(
+            cause.kind(),
+            ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::ReadOnlyFilesystem
+        )
+    })
 }
 
 /// The user stopped the run.

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 /// BLAKE3 of some bytes, shown as 64 hexadecimal digits.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct ContentHash([u8; 32]);
 
@@ -15,6 +15,11 @@ impl ContentHash {
     /// The hash of `bytes`.
     pub fn of(bytes: &[u8]) -> Self {
         Self(*blake3::hash(bytes).as_bytes())
+    }
+
+    /// One hash for several, in their order.
+    pub fn of_all(hashes: &[Self]) -> Self {
+        Self::of(&hashes.iter().flat_map(|hash| hash.0).collect::<Vec<u8>>())
     }
 
     /// The first eight bytes as a number, for seeds.

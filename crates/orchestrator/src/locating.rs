@@ -7,8 +7,7 @@ use setloc_camset::{PhotoLocalization, SetLocalization, Verdict};
 use setloc_sfm::MapperOutput;
 
 use crate::dataset::{ImageFolder, SkippedImage};
-use crate::fingerprint::ContentHash;
-use crate::graph::JobGraph;
+use crate::graph::{JobGraph, RunResult};
 use crate::jobs::{LocateJobs, add_features_of, add_set, add_single};
 use crate::session::Session;
 
@@ -78,30 +77,31 @@ pub fn locate(
     target: &str,
 ) -> Result<Located> {
     let mut located = Located { skipped: folder.skipped.clone(), ..Located::default() };
-    let mut keys = BTreeMap::new();
+    let mut whole = RunResult::default();
     if matches!(mode, Mode::Auto | Mode::Single) {
-        keys.extend(run(session, folder, what, (true, None), &mut located)?);
+        whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);
     }
     let found =
         located.single.iter().any(|photo| photo.name == target && photo.verdict == Verdict::Localized);
     let wanted = matches!(mode, Mode::Set | Mode::Both) || (mode == Mode::Auto && !found);
     if wanted && folder.images.len() > 1 {
-        keys.extend(run(session, folder, what, (mode == Mode::Both, Some(name)), &mut located)?);
+        whole.absorb(run(session, folder, what, (name, target), (mode == Mode::Both, true), &mut located)?);
     }
-    session.remember(name, keys)?;
+    session.remember(name, &whole)?;
     Ok(located)
 }
 
-/// Runs one graph: each photo alone, the set of this name, or both.
+/// Runs one graph: each photo alone, the set, or both.
 fn run(
     session: &Session,
     folder: &ImageFolder,
     what: &LocateJobs,
-    (alone, set_name): (bool, Option<&str>),
+    (name, target): (&str, &str),
+    (alone, as_set): (bool, bool),
     located: &mut Located,
-) -> Result<BTreeMap<String, ContentHash>> {
+) -> Result<RunResult> {
     let mut graph = JobGraph::default();
-    let set = set_name.map(|name| add_set(&mut graph, name, &folder.images, what)).transpose()?;
+    let set = as_set.then(|| add_set(&mut graph, target, &folder.images, what)).transpose()?;
     let features = match &set {
         Some(set) => set.model.features.clone(),
         None => add_features_of(&mut graph, &folder.images, &what.config),
@@ -112,7 +112,7 @@ fn run(
             folder.images.iter().zip(&features).map(|(photo, job)| add_single(&mut graph, photo, *job, what)),
         );
     }
-    session.run(&graph, |executor, result| {
+    session.run(name, &graph, |executor, result| {
         for (photo, job) in folder.images.iter().zip(&features) {
             let known = located.skipped.iter().any(|skipped| skipped.name == photo.name);
             if let (Some(reason), false) = (result.failed.get(&graph.job(*job).label()), known) {
@@ -129,6 +129,6 @@ fn run(
             let model = executor.load::<MapperOutput>(set.model.model)?;
             located.local_models = model.components.iter().map(|c| c.registered().count()).collect();
         }
-        Ok(result.keys.clone())
+        Ok(result.clone())
     })
 }

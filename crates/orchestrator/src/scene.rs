@@ -24,24 +24,25 @@ pub struct SceneFile {
     pub origin: Option<Wgs84>,
     /// What the mapper found worth saying.
     pub warnings: Vec<String>,
-    /// The configuration it was built with, as TOML.
+    /// The configuration it was built with, as TOML: of the stages that a scene depends on.
     pub config: String,
+    /// Hash of what localization depends on: the models and the index, not how images are called or what was set.
+    pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 1);
+serde_artifact!(SceneFile, "scene", 2);
 
 impl SceneFile {
-    /// Reads a scene file; returns its content hash too.
+    /// Reads a scene file.
     ///
     /// # Errors
     /// When it is missing, damaged or no scene.
-    pub fn read(path: &Path) -> Result<(Self, ContentHash)> {
+    pub fn read(path: &Path) -> Result<Self> {
         let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-        let scene = codec::decode(&bytes).map_err(|error| {
+        codec::decode(&bytes).map_err(|error| {
             let error = anyhow::Error::new(error).context(format!("{} is no usable scene", path.display()));
             Hinted::wrap(error, "build it again with `setloc build PANORAMAS -o scene.setloc`")
-        })?;
-        Ok((scene, ContentHash::of(&bytes)))
+        })
     }
 
     /// The largest component.

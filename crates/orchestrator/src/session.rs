@@ -1,15 +1,14 @@
 //! What the commands share: the store, the listeners and a way to stop.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use anyhow::Result;
 
-use crate::fingerprint::ContentHash;
+use crate::clock;
 use crate::graph::{Broadcast, Executor, JobGraph, Observer, RunOptions, RunResult};
-use crate::store::Store;
+use crate::store::{LastRun, Store};
 use crate::subscribers::{Console, JsonLog, RunReport};
 
 /// How much of the machine a session may use.
@@ -49,10 +48,14 @@ impl Session {
 
     /// Runs a graph and hands the results to `use_results`.
     ///
+    /// Of a run that does not come to its end, the results made so far are noted under `name`, so that garbage
+    /// collection leaves them for the next attempt.
+    ///
     /// # Errors
     /// When stopped, when the store cannot be written, or as `use_results` does.
     pub fn run<R>(
         &self,
+        name: &str,
         graph: &JobGraph<'_>,
         use_results: impl FnOnce(&Executor<'_>, &RunResult) -> Result<R>,
     ) -> Result<R> {
@@ -64,16 +67,28 @@ impl Session {
             stop: &self.stop,
         };
         let executor = Executor::new(graph, &options);
-        let result = executor.run()?;
-        use_results(&executor, &result)
+        match executor.run() {
+            Ok(result) => use_results(&executor, &result),
+            Err(error) => {
+                // On a full disk this fails as well; what the caller has to hear is why the run ended.
+                let _ = self.store.note_unfinished(name, executor.result().keys);
+                Err(error)
+            }
+        }
     }
 
-    /// Remembers the keys of a run under a name, for `plan` and `explain`.
+    /// Remembers a run under a name, for `plan`, `explain` and `status`.
     ///
     /// # Errors
     /// When the store cannot be written.
-    pub fn remember(&self, name: &str, keys: BTreeMap<String, ContentHash>) -> Result<()> {
-        self.store.remember_run(name, keys)
+    pub fn remember(&self, name: &str, run: &RunResult) -> Result<()> {
+        let last = LastRun {
+            ended_unix_s: clock::unix_secs(),
+            ran: run.ran.len(),
+            stored: run.keys.len().saturating_sub(run.ran.len()),
+            failed: run.failed.clone(),
+        };
+        self.store.remember_run(name, run.keys.clone(), last)
     }
 }
 
@@ -85,7 +100,7 @@ pub fn stop_on_signal() -> Arc<AtomicBool> {
         let flag = Arc::clone(&stop);
         let handler = move || {
             if flag.swap(true, Ordering::SeqCst) {
-                std::process::exit(2);
+                std::process::exit(i32::from(crate::cli::STOPPED));
             }
             crate::print::note("stopping after the running jobs; press Ctrl-C again to stop at once");
         };

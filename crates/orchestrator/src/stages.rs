@@ -20,6 +20,10 @@ pub const VERIFY_VERSION: u32 = setloc_sfm::TWO_VIEW_VERSION;
 pub const MAPPER_VERSION: u32 = setloc_sfm::MAPPER_VERSION;
 /// Version of indexing.
 pub const INDEX_VERSION: u32 = setloc_index::VERSION;
+/// Version of the scene file's making.
+///
+/// 2: holds the hash of what localization depends on, and only the configuration that the scene depends on.
+pub const SCENE_VERSION: u32 = 2;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
 /// Version of set localization.

@@ -2,17 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
 
-use std::path::Path;
-use std::process::{Command, Output};
+mod common;
 
-fn setloc(folder: &Path, arguments: &[&str]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_setloc"));
-    command.current_dir(folder).env_remove("SETLOC_CACHE").args(arguments).output().unwrap()
-}
-
-fn said(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
+use common::{said, setloc};
 
 fn picture(shade: u8) -> image::RgbImage {
     image::RgbImage::from_fn(256, 128, |x, y| image::Rgb([(x as u8) ^ (y as u8).wrapping_mul(shade); 3]))

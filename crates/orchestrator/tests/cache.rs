@@ -2,34 +2,21 @@
 
 #![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
 
-use std::path::{Path, PathBuf};
+mod common;
+
+use std::collections::BTreeSet;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use setloc_orchestrator::building::{BuildOutcome, Built, build_scene};
 use setloc_orchestrator::config::Config;
 use setloc_orchestrator::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
+use setloc_orchestrator::jobs::LocateJobs;
+use setloc_orchestrator::locating::{Mode, locate};
 use setloc_orchestrator::session::{Limits, Session};
 
-/// A picture of its own for each seed: blocks of grey.
-fn write_picture(path: &Path, seed: u32) {
-    let mut state = seed.wrapping_mul(2_654_435_761).wrapping_add(12345);
-    let mut shades = Vec::new();
-    for _ in 0..64 * 32 {
-        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-        shades.push((state >> 24) as u8);
-    }
-    let picture =
-        image::RgbImage::from_fn(256, 128, |x, y| image::Rgb([shades[((y / 4) * 64 + x / 4) as usize]; 3]));
-    picture.save(path).unwrap();
-}
-
-fn panoramas(folder: &Path, count: u32) -> PathBuf {
-    let panoramas = folder.join("panoramas");
-    std::fs::create_dir_all(&panoramas).unwrap();
-    (0..count).for_each(|i| write_picture(&panoramas.join(format!("p{i}.png")), i));
-    panoramas
-}
+use common::{files_below, logged, panoramas, program, said, setloc, town, write_picture};
 
 fn build(store: &Path, panoramas: &Path, config: &Config) -> Box<Built> {
     let limits = Limits { threads: 2, memory: 1 << 30 };
@@ -44,16 +31,6 @@ fn build(store: &Path, panoramas: &Path, config: &Config) -> Box<Built> {
 
 fn ran<'b>(built: &'b Built, kind: &str) -> Vec<&'b str> {
     built.run.ran.iter().filter_map(|job| job.strip_prefix(kind)?.strip_prefix(' ')).collect()
-}
-
-fn files_below(folder: &Path) -> Vec<PathBuf> {
-    let mut files = Vec::new();
-    for entry in std::fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        if path.is_dir() { files.extend(files_below(&path)) } else { files.push(path) }
-    }
-    files.sort();
-    files
 }
 
 #[test]
@@ -79,6 +56,58 @@ fn a_changed_parameter_runs_only_what_depends_on_it() {
     assert_eq!(ran(&built, "verify").len(), 3);
     // The scene file names its configuration; nothing else may follow from verifications that came out the same.
     assert_eq!(ran(&built, "scene").len(), 1);
+}
+
+/// Builds the town's scene and locates its set in it; the labels of the jobs that ran.
+fn build_and_locate(folder: &Path, config: &Config) -> Vec<String> {
+    let (town, log) = (folder.join("town"), folder.join("run.jsonl"));
+    let limits = Limits { threads: 2, memory: 1 << 30 };
+    let stop = Arc::new(AtomicBool::new(false));
+    let session = Session::open(&folder.join("store"), Some(&log), limits, stop).unwrap();
+    let cameras = CameraBook::read(&town.join("cameras.json")).unwrap();
+    let read = |part: &str| {
+        let files = list_images(&[town.join(part)]).unwrap();
+        ImageFolder::read(&files, &cameras, &GeoSource::None, None).unwrap()
+    };
+    let built = match build_scene(&session, &read("panoramas"), config, 7, "scene", None).unwrap() {
+        BuildOutcome::Built(built) => built,
+        BuildOutcome::Unchanged(..) => panic!("no present hash was given"),
+    };
+    assert!(built.scene.main().is_some(), "the small town must be mapped for this test to say anything");
+    let what = LocateJobs { scene: built.scene, config: config.clone(), seed: 7 };
+    let photos = read("queries/lane");
+    let target = photos.images.last().unwrap().name.clone();
+    locate(&session, &photos, &what, Mode::Both, "lane", &target).unwrap();
+    logged(&log, "finished")
+}
+
+/// The kinds among labels, each once.
+fn kinds(labels: &[String]) -> BTreeSet<&str> {
+    labels.iter().filter_map(|label| label.split(' ').next()).collect()
+}
+
+#[test]
+fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
+    let folder = tempfile::tempdir().unwrap();
+    town(folder.path());
+    let first = build_and_locate(folder.path(), &Config::default());
+    let all = ["camset", "features", "index", "local_model", "matches", "model", "scene", "single", "verify"];
+    assert_eq!(kinds(&first), BTreeSet::from(all));
+    assert_eq!(build_and_locate(folder.path(), &Config::default()), [""; 0]);
+    let after = |settings: &[&str]| {
+        let settings: Vec<String> = settings.iter().map(|&setting| setting.to_owned()).collect();
+        build_and_locate(folder.path(), &Config::resolve(None, &settings).unwrap())
+    };
+    assert_eq!(after(&["camset.ratio=0.65"]), ["camset lane/img_03.jpg"]);
+    assert_eq!(kinds(&after(&["single.ratio=0.65"])), BTreeSet::from(["single"]));
+    let bundle = after(&["sfm.loss_sigma=1.5"]);
+    assert_eq!(
+        kinds(&bundle),
+        BTreeSet::from(["model", "local_model", "index", "scene", "single", "camset"])
+    );
+    let features = after(&["features.max_features=300"]);
+    assert_eq!(kinds(&features), BTreeSet::from(all));
+    assert_eq!(features.len(), first.len());
 }
 
 #[test]
@@ -122,6 +151,45 @@ fn a_renamed_panorama_redoes_only_the_names() {
 }
 
 #[test]
+fn a_changed_folder_of_panoramas_runs_exactly_what_follows() {
+    let folder = tempfile::tempdir().unwrap();
+    let (images, store) = (town(folder.path()).join("panoramas"), folder.path().join("store"));
+    let files: Vec<String> = files_below(&images)
+        .iter()
+        .map(|path| path.file_name().unwrap().to_string_lossy().into_owned())
+        .collect();
+    let [first, .., last] = &files[..] else { panic!("a town has panoramas") };
+    let mut job_lists = Vec::new();
+    let mut step = |change: &dyn Fn()| {
+        change();
+        job_lists.push(build(&store, &images, &Config::default()).run.ran);
+    };
+    let (aside, path) = (folder.path().join("aside.jpg"), |name: &str| images.join(name));
+    step(&|| std::fs::rename(path(last), &aside).unwrap());
+    step(&|| std::fs::rename(&aside, path(last)).unwrap());
+    step(&|| {
+        let pixels = image::open(path(last)).unwrap().to_rgb8();
+        image::imageops::flip_horizontal(&pixels).save(path(last)).unwrap();
+    });
+    step(&|| std::fs::rename(path(last), path("renamed.jpg")).unwrap());
+    step(&|| std::fs::remove_file(path(first)).unwrap());
+    let [_, added, replaced, renamed, removed] = &job_lists[..] else { panic!("five steps were made") };
+    let pairs_of = |new: &str, others: &[String]| {
+        let pair = |kind: &str, other: &String| format!("{kind} panoramas/{other} panoramas/{new}");
+        let mut jobs = vec![format!("features panoramas/{new}")];
+        jobs.extend(others.iter().flat_map(|other| [pair("matches", other), pair("verify", other)]));
+        jobs.extend(["model scene", "index scene", "scene scene"].map(str::to_owned));
+        jobs.sort();
+        jobs
+    };
+    let others = &files[..files.len() - 1];
+    assert_eq!(*added, pairs_of(last, others));
+    assert_eq!(*replaced, pairs_of(last, others));
+    assert_eq!(*renamed, ["scene scene"]);
+    assert_eq!(*removed, ["index scene", "model scene", "scene scene"]);
+}
+
+#[test]
 fn a_moved_store_is_as_good_as_before() {
     let folder = tempfile::tempdir().unwrap();
     let images = panoramas(folder.path(), 3);
@@ -137,7 +205,7 @@ fn a_moved_store_is_as_good_as_before() {
 #[test]
 fn every_damaged_file_of_the_store_is_made_again() {
     let folder = tempfile::tempdir().unwrap();
-    let (images, store) = (panoramas(folder.path(), 3), folder.path().join("store"));
+    let (images, store) = (town(folder.path()).join("panoramas"), folder.path().join("store"));
     let first = build(&store, &images, &Config::default());
     for path in files_below(&store.join("objects")).into_iter().chain(files_below(&store.join("keys"))) {
         let whole = std::fs::read(&path).unwrap();
@@ -155,12 +223,23 @@ fn every_damaged_file_of_the_store_is_made_again() {
 #[test]
 fn two_builds_at_once_on_one_store_are_both_right() {
     let folder = tempfile::tempdir().unwrap();
-    let (images, store) = (panoramas(folder.path(), 4), folder.path().join("store"));
-    let hashes = std::thread::scope(|scope| {
-        let runs: Vec<_> =
-            (0..2).map(|_| scope.spawn(|| build(&store, &images, &Config::default()).hash)).collect();
-        runs.into_iter().map(|run| run.join().unwrap()).collect::<Vec<_>>()
-    });
-    assert_eq!(hashes[0], hashes[1]);
-    assert!(build(&store, &images, &Config::default()).run.ran.is_empty());
+    town(folder.path());
+    let build = |output: &str| {
+        let arguments = ["build", "town/panoramas", "--cache", "store", "-o", output];
+        let mut command = program(folder.path(), &arguments);
+        command.stderr(std::process::Stdio::null()).spawn().unwrap()
+    };
+    for mut run in ["a.setloc", "b.setloc"].map(build) {
+        assert_eq!(run.wait().unwrap().code(), Some(0));
+    }
+    let read = |name: &str| std::fs::read(folder.path().join(name)).unwrap();
+    assert!(read("a.setloc") == read("b.setloc"));
+    let verified = setloc(folder.path(), &["cache", "verify", "--cache", "store"]);
+    assert_eq!(verified.status.code(), Some(0));
+    let again = setloc(folder.path(), &["build", "town/panoramas", "--cache", "store", "-o", "c.setloc"]);
+    assert!(
+        said(&again).contains("\n0 jobs ran") && read("c.setloc") == read("a.setloc"),
+        "{}",
+        said(&again)
+    );
 }

@@ -30,7 +30,8 @@ pub struct BenchOptions {
 }
 
 /// Positions given to the scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum BenchGps {
     /// None.
     #[default]
@@ -132,8 +133,16 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         BenchGps::Geo => GeoSource::Table(root.join("geo.csv")),
     };
     let files = list_below(root, &root.join(kind))?;
+    let run_name = |folder: &Path| session.store.name_of("bench", folder);
     let folder = ImageFolder::read(&files, &cameras, &geo, None)?;
-    let built = match build_scene(session, &folder, &options.config, options.seed, "bench scene", None)? {
+    let built = match build_scene(
+        session,
+        &folder,
+        &options.config,
+        options.seed,
+        &run_name(&root.join(kind)),
+        None,
+    )? {
         BuildOutcome::Built(built) => *built,
         BuildOutcome::Unchanged(..) => anyhow::bail!("the scene was not read: this is a bug"),
     };
@@ -152,11 +161,10 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         let target = files.last().map(|(name, _)| name.clone()).unwrap_or_default();
         let what = LocateJobs {
             scene: Arc::clone(&built.scene),
-            scene_hash: built.hash,
             config: options.config.clone(),
             seed: options.seed,
         };
-        let located = locate(session, &photos, &what, Mode::Both, &format!("bench {name}"), &target)?;
+        let located = locate(session, &photos, &what, Mode::Both, &run_name(&set), &target)?;
         skipped.extend(located.skipped.clone());
         let true_photos = truth_of(truth.as_ref(), &format!("queries/{name}/"));
         sets.push(set_figures(name, files.len(), target, located, alignment.as_ref(), &true_photos));

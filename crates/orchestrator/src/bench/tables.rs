@@ -1,6 +1,6 @@
 use std::fmt::Write;
 
-use super::{Bounds, DatasetFigures, MethodFigures, SetFigures};
+use super::{AUC_THRESHOLDS_DEG, Bounds, DatasetFigures, MethodFigures, SetFigures};
 
 /// Methods in the paper's order.
 const METHODS: [&str; 3] = ["single", "camset", "camset+opt"];
@@ -84,8 +84,9 @@ fn scene_table(text: &mut String, figures: &DatasetFigures) {
         }
     }
     if let Some(auc) = &scene.auc {
-        let parts: Vec<String> =
-            auc.iter().map(|(threshold, area)| format!("{threshold}° {area:.2}")).collect();
+        let of_threshold = |threshold: f64| Some((threshold, auc.get(&threshold.to_string())?));
+        let areas = AUC_THRESHOLDS_DEG.into_iter().filter_map(of_threshold);
+        let parts: Vec<String> = areas.map(|(threshold, area)| format!("{threshold}° {area:.2}")).collect();
         add(text, format_args!("\nAUC of relative poses: {}\n", parts.join(", ")));
     }
     for skipped in &figures.skipped {

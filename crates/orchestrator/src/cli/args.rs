@@ -1,8 +1,6 @@
 //! What can be typed.
 
-use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -37,8 +35,14 @@ pub enum Command {
     Bench(BenchArgs),
     /// Build many scenes and locate many sets, from a manifest
     Batch(BatchArgs),
+    /// Show what a build or a localization came to, as text and as a page
+    Report(ReportArgs),
+    /// Show what is stored and what the last runs did
+    Status(StatusArgs),
     /// Write a scene in another format
     Export(ExportArgs),
+    /// Make cameras.json and truth.json of a COLMAP text model
+    Import(ImportArgs),
     /// Say what changed for a job or image between the last two runs
     Explain(ExplainArgs),
     /// Look after the store of results
@@ -75,17 +79,7 @@ impl RunArgs {
     }
 
     /// Opens the store; the log is a file in `log_folder`.
-    pub fn session(&self, output: &std::path::Path, log_folder: Option<&std::path::Path>) -> Result<Session> {
-        self.session_with(output, log_folder, &stop_on_signal())
-    }
-
-    /// As [`Self::session`], with a flag that exists already.
-    pub fn session_with(
-        &self,
-        output: &std::path::Path,
-        log_folder: Option<&std::path::Path>,
-        stop: &Arc<AtomicBool>,
-    ) -> Result<Session> {
+    pub fn session(&self, output: &Path, log_folder: Option<&Path>) -> Result<Session> {
         let threads =
             self.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
         let threads = threads.max(1);
@@ -97,9 +91,10 @@ impl RunArgs {
         };
         if let Some(folder) = log_folder {
             crate::store::create_folder(folder)?;
+            crate::store::remove_leftovers(folder);
         }
         let log = log_folder.map(|folder| folder.join("run.jsonl"));
-        Session::open(&cache_folder(self.cache.as_deref(), output), log.as_deref(), limits, Arc::clone(stop))
+        Session::open(&cache_folder(self.cache.as_deref(), output), log.as_deref(), limits, stop_on_signal())
     }
 }
 
@@ -206,18 +201,44 @@ pub struct LocateArgs {
 /// `setloc bench`
 #[derive(Debug, Clone, Args)]
 pub struct BenchArgs {
-    /// Data sets
-    #[arg(required = true)]
+    /// Data sets [default: those of the registry]
     pub datasets: Vec<PathBuf>,
     /// Folder for the results
     #[arg(short, long, default_value = "out")]
     pub output: PathBuf,
-    /// Positions given to the scene
+    /// Positions given to the scene; the registry has its own for each data set
     #[arg(long, value_enum, default_value_t)]
     pub gps: BenchGps,
+    /// Runs with as many seeds, from --seed on
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub repeats: u64,
     /// Options of the run; without --cache nothing is reused, so that times are those of the whole work
     #[command(flatten)]
     pub run: RunArgs,
+    /// What is registered and how
+    #[command(flatten)]
+    pub registry: RegistryArgs,
+}
+
+/// The registry of data sets, used when no data set is named.
+#[derive(Debug, Clone, Args)]
+#[command(next_help_heading = "Registry")]
+pub struct RegistryArgs {
+    /// Data sets and parameter sets (TOML)
+    #[arg(long, value_name = "FILE", default_value = "benchmarks/datasets.toml")]
+    pub registry: PathBuf,
+    /// Folder that the registry's paths are relative to [default: the registry's own]
+    #[arg(long, value_name = "DIR", env = "SETLOC_DATA")]
+    pub data: Option<PathBuf>,
+    /// Only these of the registered data sets
+    #[arg(long, value_name = "NAME", num_args = 1.., conflicts_with = "datasets")]
+    pub only: Vec<String>,
+    /// Figures to compare with [default: baseline.json beside the registry]
+    #[arg(long, value_name = "FILE", conflicts_with = "datasets")]
+    pub baseline: Option<PathBuf>,
+    /// Put the figures of this run into the baseline
+    #[arg(long, conflicts_with = "datasets")]
+    pub update_baseline: bool,
 }
 
 /// `setloc batch`
@@ -274,6 +295,37 @@ pub enum ExportFormat {
     TopView,
 }
 
+/// `setloc report`
+#[derive(Debug, Clone, Args)]
+pub struct ReportArgs {
+    /// Results of `build` (the scene file or the folder beside it) or of `locate` (its folder)
+    pub results: PathBuf,
+    /// The page to write [default: report.html in the folder]
+    #[arg(short, long, value_name = "FILE")]
+    pub output: Option<PathBuf>,
+}
+
+/// `setloc status`
+#[derive(Debug, Clone, Args)]
+pub struct StatusArgs {
+    /// Folder of stored results
+    #[arg(long, value_name = "DIR", env = "SETLOC_CACHE", default_value = ".setloc-cache")]
+    pub cache: PathBuf,
+}
+
+/// `setloc import`
+#[derive(Debug, Clone, Args)]
+pub struct ImportArgs {
+    /// Folder with cameras.txt and images.txt
+    pub model: PathBuf,
+    /// Folder for cameras.json (for --cameras) and truth.json (for `bench`)
+    #[arg(short, long, default_value = "out")]
+    pub output: PathBuf,
+    /// Put before the images' names, as `panoramas/`
+    #[arg(long, default_value = "")]
+    pub prefix: String,
+}
+
 /// `setloc explain`
 #[derive(Debug, Clone, Args)]
 pub struct ExplainArgs {
@@ -305,6 +357,9 @@ pub enum CacheCommand {
         /// Also remove the oldest results until at most this is left
         #[arg(long, value_parser = parse_bytes)]
         max: Option<u64>,
+        /// Leave what is younger, in minutes: it may belong to a run that goes on
+        #[arg(long, value_name = "MINUTES", default_value_t = 60)]
+        min_age: u64,
     },
     /// Check every stored result; damaged ones are removed
     Verify,

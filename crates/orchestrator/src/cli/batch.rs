@@ -1,145 +1,182 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use anyhow::{Context, Result};
-use serde::Deserialize;
+use serde::Serialize;
 
 use super::Answer;
 use super::args::{BatchArgs, BuildArgs, LocateArgs, RunArgs, SourceArgs};
-use crate::error::Interrupted;
+use super::build::write_json;
+use crate::error::{Interrupted, concerns_the_disk};
 use crate::locating::Mode;
+use crate::manifest::{Manifest, SceneEntry, SetEntry, Variant};
 use crate::print;
 
-/// Many scenes and sets in one file.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Manifest {
-    #[serde(default)]
-    scene: Vec<SceneEntry>,
-    /// Parameter name to values; every combination is run.
-    #[serde(default)]
-    sweep: std::collections::BTreeMap<String, Vec<toml::Value>>,
+/// What became of one scene or set.
+#[derive(Debug, Clone, Serialize)]
+struct Part {
+    name: String,
+    outcome: Outcome,
+    /// Why it failed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    reason: Option<String>,
+    wall_s: f64,
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct SceneEntry {
-    name: String,
-    panoramas: Vec<PathBuf>,
-    gps: Option<String>,
-    masks: Option<PathBuf>,
-    cameras: Option<PathBuf>,
-    #[serde(default)]
-    sets: Vec<SetEntry>,
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Outcome {
+    Done,
+    /// Not registered, not localized.
+    Negative,
+    Failed,
+    /// Not tried: its scene failed, or the batch ended before.
+    Skipped,
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct SetEntry {
-    name: String,
-    photos: Vec<PathBuf>,
-    target: Option<String>,
-    cameras: Option<PathBuf>,
+/// The parts of a batch as they come to their ends.
+struct Progress {
+    parts: Vec<Part>,
+    total: usize,
+    /// Why the rest is not tried.
+    end: Option<anyhow::Error>,
+}
+
+impl Progress {
+    /// Runs one part unless the batch has ended; says whether it gave something to go on with.
+    fn part(&mut self, name: String, work: impl FnOnce() -> Result<Answer>) -> bool {
+        if self.end.is_some() {
+            self.skip(name);
+            return false;
+        }
+        print::note(&format!("== {name} ({} of {})", self.parts.len() + 1, self.total));
+        let begun = Instant::now();
+        let result = work();
+        let wall_s = begun.elapsed().as_secs_f64();
+        let (outcome, reason) = match result {
+            Ok(Answer::Done) => (Outcome::Done, None),
+            Ok(Answer::Negative) => (Outcome::Negative, None),
+            Err(error) if error.is::<Interrupted>() => {
+                self.end = Some(error);
+                self.skip(name);
+                return false;
+            }
+            Err(error) => {
+                super::show(&error);
+                let reason = format!("{error:#}");
+                if concerns_the_disk(&error) {
+                    self.end = Some(error);
+                }
+                (Outcome::Failed, Some(reason))
+            }
+        };
+        self.parts.push(Part { name, outcome, reason, wall_s });
+        outcome != Outcome::Failed
+    }
+
+    fn skip(&mut self, name: String) {
+        self.parts.push(Part { name, outcome: Outcome::Skipped, reason: None, wall_s: 0.0 });
+    }
+
+    fn count(&self, outcome: Outcome) -> usize {
+        self.parts.iter().filter(|part| part.outcome == outcome).count()
+    }
 }
 
 /// `setloc batch`
 ///
-/// One failing scene does not stop the others. All runs share one store, so a sweep repeats only what depends on the
-/// swept parameter.
+/// One failing scene does not stop the others; a full disk and Ctrl-C do. All runs share one store, so a sweep repeats
+/// only what depends on the swept parameter.
 pub fn run(args: &BatchArgs) -> Result<Answer> {
-    let shown = args.manifest.display();
-    let text = std::fs::read_to_string(&args.manifest).with_context(|| format!("cannot read {shown}"))?;
-    let manifest: Manifest =
-        toml::from_str(&text).with_context(|| format!("{shown} is no valid manifest"))?;
-    let base = args.manifest.parent().map(PathBuf::from).unwrap_or_default();
+    let manifest = Manifest::read(&args.manifest)?;
+    let base = args.manifest.parent().unwrap_or(Path::new(""));
+    let variants = manifest.variants(args.run.config.as_deref(), &args.run.settings)?;
+    let parts: usize = manifest.scene.iter().map(|scene| 1 + scene.sets.len()).sum();
+    let mut progress = Progress { parts: Vec::new(), total: parts * variants.len(), end: None };
     let cache = args.run.cache.clone().unwrap_or_else(|| args.output.join(".setloc-cache"));
-    let (mut summary, mut failures, mut negatives) = (Vec::new(), 0, 0);
-    for (suffix, settings) in combinations(&manifest.sweep) {
-        let mut run = RunArgs { cache: Some(cache.clone()), ..args.run.clone() };
-        run.settings.extend(settings);
+    for variant in &variants {
+        let run = RunArgs {
+            cache: Some(cache.clone()),
+            settings: [&args.run.settings[..], &variant.settings].concat(),
+            ..args.run.clone()
+        };
         for entry in &manifest.scene {
-            let folder = args.output.join(format!("{}{suffix}", entry.name));
-            let mut outcomes = Vec::new();
-            let source = SourceArgs {
-                panoramas: entry.panoramas.iter().map(|path| base.join(path)).collect(),
-                output: folder.join("scene.setloc"),
-                gps: entry
-                    .gps
-                    .clone()
-                    .map(|gps| if gps == "exif" { gps } else { base.join(gps).display().to_string() }),
-                masks: entry.masks.as_ref().map(|path| base.join(path)),
-                cameras: entry.cameras.as_ref().map(|path| base.join(path)),
-                run: run.clone(),
-            };
-            let scene = source.output.clone();
-            let built = super::build::run(&BuildArgs { source, export: None, print_config: false });
-            let usable = built.is_ok();
-            outcomes.push((format!("{}{suffix}", entry.name), built));
-            for set in entry.sets.iter().filter(|_| usable) {
-                let located = super::locate::run(&LocateArgs {
-                    scene: scene.clone(),
-                    photos: set.photos.iter().map(|path| base.join(path)).collect(),
-                    target: set.target.clone(),
-                    mode: Mode::Auto,
-                    cameras: set.cameras.as_ref().map(|path| base.join(path)),
-                    output: folder.join(&set.name),
-                    run: run.clone(),
-                });
-                outcomes.push((format!("{}{suffix}/{}", entry.name, set.name), located));
-            }
-            for (name, outcome) in outcomes {
-                let word = match outcome {
-                    Ok(Answer::Done) => "done".to_owned(),
-                    Ok(Answer::Negative) => {
-                        negatives += 1;
-                        "negative".to_owned()
-                    }
-                    Err(error) if error.is::<Interrupted>() => return Err(error),
-                    Err(error) => {
-                        failures += 1;
-                        super::show(&error);
-                        format!("failed: {error:#}")
-                    }
-                };
-                summary.push(format!("{name}\t{word}"));
-            }
+            run_scene(&mut progress, entry, variant, &Places { base, output: &args.output, run: &run });
         }
     }
-    for line in &summary {
-        print::data(line);
-    }
-    anyhow::ensure!(failures == 0, "{failures} of {} parts failed", summary.len());
-    Ok(if negatives == 0 { Answer::Done } else { Answer::Negative })
+    finish(args, &progress)
 }
 
-/// Every combination of swept values: a name to add to folders, and the settings.
-fn combinations(sweep: &std::collections::BTreeMap<String, Vec<toml::Value>>) -> Vec<(String, Vec<String>)> {
-    let mut all = vec![(String::new(), Vec::new())];
-    for (key, values) in sweep {
-        let extend = |(suffix, settings): &(String, Vec<String>)| {
-            let one = |value: &toml::Value| {
-                let mut settings = settings.clone();
-                settings.push(format!("{key}={value}"));
-                (format!("{suffix}-{key}={}", value.to_string().replace(['/', '"'], "")), settings)
-            };
-            values.iter().map(one).collect::<Vec<_>>()
+/// Where the parts of one variant come from and go to.
+struct Places<'a> {
+    base: &'a Path,
+    output: &'a Path,
+    run: &'a RunArgs,
+}
+
+fn run_scene(progress: &mut Progress, entry: &SceneEntry, variant: &Variant, places: &Places<'_>) {
+    let below = |path: &PathBuf| places.base.join(path);
+    let name = format!("{}{}", entry.name, variant.suffix);
+    let folder = places.output.join(&name);
+    let scene = folder.join("scene.setloc");
+    let gps = |gps: &String| match gps.as_str() {
+        "exif" => gps.clone(),
+        table => places.base.join(table).display().to_string(),
+    };
+    let source = SourceArgs {
+        panoramas: entry.panoramas.iter().map(below).collect(),
+        output: scene.clone(),
+        gps: entry.gps.as_ref().map(gps),
+        masks: entry.masks.as_ref().map(below),
+        cameras: entry.cameras.as_ref().map(below),
+        run: places.run.clone(),
+    };
+    let build = BuildArgs { source, export: None, print_config: false };
+    let built = progress.part(name.clone(), || super::build::run(&build));
+    for set in &entry.sets {
+        let set_name = format!("{name}/{}", set.name);
+        if built {
+            let locate = locate_args(set, &scene, &folder, places);
+            progress.part(set_name, || Ok(super::locate::locate_photos(&locate)?.1));
+        } else {
+            progress.skip(set_name);
+        }
+    }
+}
+
+fn locate_args(set: &SetEntry, scene: &Path, folder: &Path, places: &Places<'_>) -> LocateArgs {
+    LocateArgs {
+        scene: scene.to_owned(),
+        photos: set.photos.iter().map(|path| places.base.join(path)).collect(),
+        target: set.target.clone(),
+        mode: Mode::Auto,
+        cameras: set.cameras.as_ref().map(|path| places.base.join(path)),
+        output: folder.join(&set.name),
+        run: places.run.clone(),
+    }
+}
+
+/// Prints and writes the summary; the worst part decides the answer.
+fn finish(args: &BatchArgs, progress: &Progress) -> Result<Answer> {
+    for part in &progress.parts {
+        let word = match (part.outcome, &part.reason) {
+            (Outcome::Done, _) => "done".to_owned(),
+            (Outcome::Negative, _) => "negative".to_owned(),
+            (Outcome::Skipped, _) => "skipped".to_owned(),
+            (Outcome::Failed, reason) => format!("failed: {}", reason.as_deref().unwrap_or_default()),
         };
-        all = all.iter().flat_map(extend).collect();
+        print::data(&format!("{}\t{word}\t{:.1} s", part.name, part.wall_s));
     }
-    all
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_sweep_is_every_combination() {
-        let sweep = toml::from_str("\"camset.a\" = [1, 2]\n\"sfm.b\" = [true, false, true]").unwrap();
-        let all = combinations(&sweep);
-        assert_eq!(all.len(), 6);
-        assert_eq!(
-            all[0],
-            ("-camset.a=1-sfm.b=true".to_owned(), vec!["camset.a=1".to_owned(), "sfm.b=true".to_owned()])
-        );
+    let [done, negative, failed, skipped] =
+        [Outcome::Done, Outcome::Negative, Outcome::Failed, Outcome::Skipped]
+            .map(|outcome| progress.count(outcome));
+    print::note(&format!("{done} done, {negative} negative, {failed} failed, {skipped} skipped"));
+    let written = write_json(&args.output.join("summary.json"), &progress.parts);
+    match &progress.end {
+        Some(error) if error.is::<Interrupted>() => return Err(Interrupted.into()),
+        Some(error) => anyhow::bail!("the batch ended early: {error:#}"),
+        None => written.context("cannot write the batch's summary")?,
     }
+    anyhow::ensure!(failed == 0, "{failed} of {} parts failed", progress.total);
+    Ok(if negative == 0 { Answer::Done } else { Answer::Negative })
 }

@@ -8,41 +8,159 @@ use setloc_sfm::Rigid;
 use super::Answer;
 use super::args::{BenchArgs, RunArgs};
 use super::build::{scene_markers, warn_skipped, write_json};
-use crate::bench::{BenchOptions, DatasetFigures, bench_dataset, errors_csv, markdown_tables};
+use super::demo::render_town;
+use crate::bench::{
+    Availability, Baseline, BenchGps, BenchOptions, DatasetEntry, DatasetFigures, Harness, HarnessRun,
+    ParameterSet, Registry, about, bench_dataset, errors_csv, figures_section, html_report, markdown_tables,
+    metrics_of,
+};
+use crate::error::{Hinted, Interrupted, concerns_the_disk};
 use crate::export::{Marker, top_view_png};
+use crate::html::page;
 use crate::print;
-use crate::session::stop_on_signal;
-use crate::store::write_atomically;
+use crate::store::{create_folder, write_atomically};
 
 /// `setloc bench`
 pub fn run(args: &BenchArgs) -> Result<Answer> {
-    let options = BenchOptions { config: args.run.config()?, seed: args.run.seed, gps: args.gps };
-    let stop = stop_on_signal();
+    if args.datasets.is_empty() {
+        return run_registry(args);
+    }
     for root in &args.datasets {
         let root = root.canonicalize().with_context(|| format!("cannot open {}", root.display()))?;
         let output = match args.datasets.len() {
             1 => args.output.clone(),
             _ => args.output.join(root.file_name().unwrap_or_default()),
         };
-        std::fs::create_dir_all(&output).with_context(|| format!("cannot write {}", output.display()))?;
-        // Without a given store nothing is reused, so the times are those of the whole work.
-        let fresh = tempfile::Builder::new().prefix(".bench-cache-").tempdir_in(&output)?;
-        let cache = args.run.cache.clone().unwrap_or_else(|| fresh.path().to_owned());
-        let run = RunArgs { cache: Some(cache), ..args.run.clone() };
-        let session = run.session_with(&output, Some(&output), &stop)?;
-        let figures = bench_dataset(&session, &root, &options)?;
-        write_figures(&output, &figures)?;
-        warn_skipped(&figures.skipped);
-        print::data(markdown_tables(&figures).trim_end());
+        let figures = with_cache(&args.run, &output, |run| repeat(args, run, &root, args.gps, &output))?;
+        for of_seed in &figures {
+            warn_skipped(&of_seed.skipped);
+            print::data(markdown_tables(of_seed).trim_end());
+        }
+        if figures.len() > 1 {
+            let metrics = metrics_of(&figures);
+            write_json(&output.join("repeats.json"), &metrics)?;
+            for (name, value) in &metrics {
+                print::data(&format!("{name}\t{:.4} ± {:.4}", value.mean, value.deviation));
+            }
+        }
         print::note(&format!("wrote {}/", output.display()));
     }
     Ok(Answer::Done)
 }
 
-/// `results.json`, tables, errors, poses and pictures.
+/// Runs over all that is registered and compares with the baseline.
+fn run_registry(args: &BenchArgs) -> Result<Answer> {
+    let file = &args.registry.registry;
+    let mut registry = Registry::read(file)?;
+    registry.keep_only(&args.registry.only)?;
+    let beside = file.parent().unwrap_or(Path::new(""));
+    let data = args.registry.data.clone().unwrap_or_else(|| beside.to_owned());
+    let baseline_file = args.registry.baseline.clone().unwrap_or_else(|| beside.join("baseline.json"));
+    let mut baseline = Baseline::read(&baseline_file)?;
+    let mut harness = Harness { seeds: seeds(args).collect(), ..Harness::default() };
+    for entry in &registry.dataset {
+        let root = match entry.find(&data)? {
+            Availability::Present(folder) => folder.canonicalize()?,
+            Availability::Rendered => render_town(&args.output.join(".sample"))?,
+            Availability::Missing(reason) => {
+                print::note(&format!("skipped {}: {reason}", entry.name));
+                harness.skipped.push((entry.name.clone(), reason));
+                continue;
+            }
+        };
+        // One store for all parameter sets and seeds: what does not depend on them is done once.
+        let output = args.output.join(&entry.name);
+        let runs = with_cache(&args.run, &output, |run| {
+            registry.parameters.iter().map(|set| run_entry(args, run, entry, set, &root)).collect()
+        });
+        match runs {
+            Ok(runs) => harness.runs.extend::<Vec<HarnessRun>>(runs),
+            Err(error) if error.is::<Interrupted>() || concerns_the_disk(&error) => return Err(error),
+            Err(error) => {
+                print::note(&format!("{} failed:", entry.name));
+                super::show(&error);
+                harness.skipped.push((entry.name.clone(), format!("failed: {error:#}")));
+            }
+        }
+    }
+    let failed = harness.skipped.iter().filter(|(_, reason)| reason.starts_with("failed: ")).count();
+    let metrics = harness.metrics();
+    harness.deltas = (!baseline.runs.is_empty()).then(|| baseline.compare(&metrics));
+    write_json(&args.output.join("results.json"), &harness.to_json())?;
+    write_atomically(&args.output.join("summary.md"), harness.to_markdown().as_bytes())?;
+    write_atomically(&args.output.join("report.html"), html_report(&harness).as_bytes())?;
+    print::data(harness.to_markdown().trim_end());
+    print::note(&format!("wrote {}/", args.output.display()));
+    if args.registry.update_baseline {
+        baseline.update(&metrics);
+        write_json(&baseline_file, &baseline)?;
+        print::note(&format!("wrote {}", baseline_file.display()));
+    }
+    anyhow::ensure!(failed == 0, "{failed} data sets failed");
+    if harness.runs.is_empty() {
+        let hint = "name the folder that has them with --data DIR or SETLOC_DATA";
+        return Err(Hinted::error("none of the registered data sets is present", hint));
+    }
+    let regressed = harness.has_regressed() && !args.registry.update_baseline;
+    Ok(if regressed { Answer::Negative } else { Answer::Done })
+}
+
+/// All repeats of a registered data set with one parameter set.
+fn run_entry(
+    args: &BenchArgs,
+    run: &RunArgs,
+    entry: &DatasetEntry,
+    set: &ParameterSet,
+    root: &Path,
+) -> Result<HarnessRun> {
+    let name = format!("{}/{}", entry.name, set.name);
+    print::note(&format!("== {name}"));
+    // What the command line sets holds for every parameter set.
+    let run = RunArgs { settings: [&set.settings[..], &run.settings].concat(), ..run.clone() };
+    let output = args.output.join(&entry.name).join(&set.name);
+    let figures = repeat(args, &run, root, entry.gps, &output)?;
+    let metrics = metrics_of(&figures);
+    let about = about(entry.truth, &entry.licence);
+    Ok(HarnessRun { name, about, settings: set.settings.clone(), figures, metrics })
+}
+
+fn seeds(args: &BenchArgs) -> impl Iterator<Item = u64> {
+    (0..args.repeats).map(|repeat| args.run.seed.wrapping_add(repeat))
+}
+
+/// One run for each seed; the results of the first lie in `output`, those of others in folders of their own.
+fn repeat(
+    args: &BenchArgs,
+    run: &RunArgs,
+    root: &Path,
+    gps: BenchGps,
+    output: &Path,
+) -> Result<Vec<DatasetFigures>> {
+    let one = |seed: u64| {
+        let output =
+            if seed == args.run.seed { output.to_owned() } else { output.join(format!("seed-{seed}")) };
+        let session = run.session(&output, Some(&output))?;
+        let figures = bench_dataset(&session, root, &BenchOptions { config: run.config()?, seed, gps })?;
+        write_figures(&output, &figures)?;
+        Ok(figures)
+    };
+    seeds(args).map(one).collect()
+}
+
+/// Calls `work` with the given store, else with a new one, so that the times are those of the whole work.
+fn with_cache<R>(run: &RunArgs, output: &Path, work: impl FnOnce(&RunArgs) -> Result<R>) -> Result<R> {
+    create_folder(output)?;
+    let fresh = tempfile::Builder::new().prefix(".bench-cache-").tempdir_in(output)?;
+    let cache = run.cache.clone().unwrap_or_else(|| fresh.path().to_owned());
+    work(&RunArgs { cache: Some(cache), ..run.clone() })
+}
+
+/// `results.json`, tables, plots, errors, poses and pictures.
 pub fn write_figures(folder: &Path, figures: &DatasetFigures) -> Result<()> {
     write_json(&folder.join("results.json"), figures)?;
     write_atomically(&folder.join("tables.md"), markdown_tables(figures).as_bytes())?;
+    let html = page(&figures.dataset, &figures_section(figures));
+    write_atomically(&folder.join("report.html"), html.as_bytes())?;
     write_atomically(&folder.join("errors.csv"), errors_csv(figures).as_bytes())?;
     let scene =
         figures.model.images.iter().filter_map(|image| Some((image.name.clone(), image.world_from_camera?)));

@@ -1,6 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use serde_json::Value;
 use setloc_features::ImageFeatures;
 use setloc_sfm::Reconstruction;
 
@@ -33,9 +34,11 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     let output = &args.source.output;
     let export = args.export.clone().unwrap_or_else(|| export_folder(output));
     let session = args.source.run.session(output, Some(&export))?;
+    let name = session.store.name_of("build", output);
     let present = std::fs::read(output).ok().map(|bytes| ContentHash::of(&bytes));
-    let present = present.filter(|_| export.join("report.json").is_file());
-    let outcome = build_scene(&session, &folder, &config, args.source.run.seed, &run_name(output), present)?;
+    // The report is written last: exports of another scene, as a killed run leaves them, are none of this one.
+    let present = present.filter(|hash| reported_scene(&export) == Some(*hash));
+    let outcome = build_scene(&session, &folder, &config, args.source.run.seed, &name, present)?;
     let (run, skipped) = match &outcome {
         BuildOutcome::Unchanged(run, skipped) => {
             print::note(&format!("{} is up to date: nothing changed", output.display()));
@@ -55,7 +58,7 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     print::note(&format!("wrote {} and {}/", output.display(), export.display()));
     let registered = match &outcome {
         BuildOutcome::Built(built) => built.scene.main().is_some(),
-        BuildOutcome::Unchanged(..) => SceneFile::read(output)?.0.main().is_some(),
+        BuildOutcome::Unchanged(..) => SceneFile::read(output)?.main().is_some(),
     };
     Ok(if registered { Answer::Done } else { Answer::Negative })
 }
@@ -70,8 +73,8 @@ pub fn plan(args: &PlanArgs) -> Result<Answer> {
         print::data(graph.to_dot().trim_end());
         return Ok(Answer::Done);
     }
-    let store = Store::open(&cache_folder(args.source.run.cache.as_deref(), &args.source.output))?;
-    let planned = graph.plan(&store, &store.run(&run_name(&args.source.output)));
+    let store = Store::at(&cache_folder(args.source.run.cache.as_deref(), &args.source.output));
+    let planned = graph.plan(&store, &store.run(&store.name_of("build", &args.source.output)));
     if args.format == PlanFormat::Json {
         print::data(&serde_json::to_string_pretty(&planned)?);
         return Ok(Answer::Done);
@@ -91,6 +94,12 @@ pub fn plan(args: &PlanArgs) -> Result<Answer> {
     Ok(Answer::Done)
 }
 
+/// The scene whose exports are in a folder.
+fn reported_scene(folder: &Path) -> Option<ContentHash> {
+    let report: Value = serde_json::from_slice(&std::fs::read(folder.join("report.json")).ok()?).ok()?;
+    serde_json::from_value(report["scene"].clone()).ok()
+}
+
 fn read_sources(source: &SourceArgs) -> Result<ImageFolder> {
     if source.panoramas.is_empty() {
         return Err(Hinted::error(
@@ -102,13 +111,8 @@ fn read_sources(source: &SourceArgs) -> Result<ImageFolder> {
     ImageFolder::read(&files, &source.camera_book()?, &source.geo(), source.masks.as_deref())
 }
 
-/// Name of the run that makes a scene file.
-fn run_name(output: &Path) -> String {
-    format!("build {}", output.file_name().unwrap_or_default().to_string_lossy())
-}
-
 /// The scene file's name without its ending, or with `-export` when it has none.
-fn export_folder(output: &Path) -> PathBuf {
+pub fn export_folder(output: &Path) -> PathBuf {
     let folder = output.with_extension("");
     if folder == output { PathBuf::from(format!("{}-export", output.display())) } else { folder }
 }

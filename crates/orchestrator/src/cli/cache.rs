@@ -1,4 +1,5 @@
 use std::path::Path;
+use std::time::Duration;
 
 use anyhow::Result;
 
@@ -9,9 +10,9 @@ use crate::print;
 use crate::store::Store;
 
 /// A store that is there already: a mistyped folder must not be made.
-fn existing(folder: &Path) -> Result<Store> {
+pub fn existing(folder: &Path) -> Result<Store> {
     if folder.join("objects").is_dir() {
-        return Store::open(folder);
+        return Ok(Store::at(folder));
     }
     let message = format!("{} is no store of results", folder.display());
     Err(Hinted::error(
@@ -36,10 +37,16 @@ pub fn run(args: &CacheArgs) -> Result<Answer> {
                     summary.orphans
                 ));
             }
+            if summary.unfinished > 0 {
+                print::data(&format!(
+                    "{} files are being written, or were left by a killed run; `setloc cache gc` removes old ones",
+                    summary.unfinished
+                ));
+            }
         }
-        CacheCommand::Gc { max } => {
-            let (count, bytes) = store.collect_garbage(max)?;
-            print::data(&format!("removed {count} objects, {}", mebibytes(bytes)));
+        CacheCommand::Gc { max, min_age } => {
+            let removed = store.collect_garbage(max, Duration::from_mins(min_age))?;
+            print::data(&format!("removed {} files, {}", removed.files, mebibytes(removed.bytes)));
         }
         CacheCommand::Verify => {
             let damaged = store.verify()?;
@@ -53,7 +60,7 @@ pub fn run(args: &CacheArgs) -> Result<Answer> {
     Ok(Answer::Done)
 }
 
-fn mebibytes(bytes: u64) -> String {
+pub fn mebibytes(bytes: u64) -> String {
     format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
 }
 
@@ -61,8 +68,7 @@ fn mebibytes(bytes: u64) -> String {
 pub fn explain(args: &ExplainArgs) -> Result<Answer> {
     let store = existing(&args.cache)?;
     let mut found = false;
-    for run in store.runs()? {
-        let record = store.run(&run);
+    for (run, record) in store.runs()? {
         for (label, key) in record.jobs.iter().filter(|(label, _)| label.contains(&args.job)) {
             found = true;
             let now = store.record(*key);

@@ -1,3 +1,5 @@
+use std::path::{Path, PathBuf};
+
 use anyhow::{Context, Result};
 
 use super::Answer;
@@ -9,27 +11,12 @@ use crate::stages;
 
 /// `setloc demo`
 pub fn run(args: &DemoArgs) -> Result<Answer> {
-    let town = args.output.join("town");
-    if !town.join("truth.json").is_file() {
-        print::note(&format!("rendering the sample town into {}/", town.display()));
-        // Under its final name only when whole.
-        let unfinished = args.output.join(".town-unfinished");
-        if unfinished.exists() {
-            std::fs::remove_dir_all(&unfinished)?;
-        }
-        std::fs::create_dir_all(&unfinished)
-            .with_context(|| format!("cannot write {}", unfinished.display()))?;
-        stages::write_sample(&unfinished).context("cannot render the sample town")?;
-        if town.exists() {
-            std::fs::remove_dir_all(&town)?;
-        }
-        std::fs::rename(&unfinished, &town)?;
-    }
+    let town = render_town(&args.output)?;
     let cache = args.run.cache.clone().unwrap_or_else(|| args.output.join(".setloc-cache"));
     let run = RunArgs { cache: Some(cache), ..args.run.clone() };
     let session = run.session(&args.output, Some(&args.output))?;
     let options = BenchOptions { config: run.config()?, seed: run.seed, gps: BenchGps::None };
-    let figures = bench_dataset(&session, &town.canonicalize()?, &options)?;
+    let figures = bench_dataset(&session, &town, &options)?;
     write_figures(&args.output, &figures)?;
     print::data(markdown_tables(&figures).trim_end());
     let mut good = figures.scene.registered == figures.scene.images;
@@ -42,4 +29,25 @@ pub fn run(args: &DemoArgs) -> Result<Answer> {
     }
     print::note(&format!("look at {}/top_view.png, tables.md, errors.csv and sets/", args.output.display()));
     Ok(if good { Answer::Done } else { Answer::Negative })
+}
+
+/// The sample town below a folder, rendered unless it is there.
+pub fn render_town(output: &Path) -> Result<PathBuf> {
+    let town = output.join("town");
+    if !town.join("truth.json").is_file() {
+        print::note(&format!("rendering the sample town into {}/", town.display()));
+        // Under its final name only when whole.
+        let unfinished = output.join(".town-unfinished");
+        if unfinished.exists() {
+            std::fs::remove_dir_all(&unfinished)?;
+        }
+        std::fs::create_dir_all(&unfinished)
+            .with_context(|| format!("cannot write {}", unfinished.display()))?;
+        stages::write_sample(&unfinished).context("cannot render the sample town")?;
+        if town.exists() {
+            std::fs::remove_dir_all(&town)?;
+        }
+        std::fs::rename(&unfinished, &town)?;
+    }
+    Ok(town.canonicalize()?)
 }

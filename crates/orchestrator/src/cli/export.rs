@@ -12,7 +12,7 @@ use crate::store::write_atomically;
 
 /// `setloc export`
 pub fn run(args: &ExportArgs) -> Result<Answer> {
-    let (scene, _) = SceneFile::read(&args.scene)?;
+    let scene = SceneFile::read(&args.scene)?;
     let empty = Reconstruction::default();
     let model = scene.main().unwrap_or(&empty);
     let needs_output =

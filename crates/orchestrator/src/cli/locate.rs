@@ -26,30 +26,38 @@ const PHOTO_COLOR: [u8; 3] = [240, 150, 0];
 
 /// `setloc locate`
 pub fn run(args: &LocateArgs) -> Result<Answer> {
+    let (located, answer) = locate_photos(args)?;
+    for (method, photo) in located.answers() {
+        print::data(&line(method, photo));
+    }
+    Ok(answer)
+}
+
+/// Locates the photos and writes the output folder; the answer is negative when the target is not localized.
+pub fn locate_photos(args: &LocateArgs) -> Result<(Located, Answer)> {
     let config = args.run.config()?;
-    let (scene, scene_hash) = SceneFile::read(&args.scene)?;
+    let scene = SceneFile::read(&args.scene)?;
     let files = list_images(&args.photos)?;
     let target = find_target(args.target.as_deref(), &files)?;
     let cameras = args.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default();
     let photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
     // Results of photos are kept beside the scene, where those of its images are.
     let session = args.run.session(&args.scene, Some(&args.output))?;
-    let what = LocateJobs { scene: Arc::new(scene), scene_hash, config, seed: args.run.seed };
-    let name = format!("locate {}", args.output.file_name().unwrap_or_default().to_string_lossy());
+    let what = LocateJobs { scene: Arc::new(scene), config, seed: args.run.seed };
+    let name = session.store.name_of("locate", &args.output);
     let located = locate(&session, &photos, &what, args.mode, &name, &target)?;
     write_results(&args.output, &located, &what.scene, &target, &session)?;
     warn_skipped(&located.skipped);
-    let answers = located.answers();
-    for (method, photo) in &answers {
-        print::data(&line(method, photo));
-    }
     for advice in located.set.iter().flat_map(|set| &set.advice) {
         print::note(&format!("advice: {advice}"));
     }
     print::note(&format!("wrote {}/", args.output.display()));
-    let found = answers.iter().any(|(_, photo)| photo.name == target && photo.verdict == Verdict::Localized);
+    let found = located
+        .answers()
+        .iter()
+        .any(|(_, photo)| photo.name == target && photo.verdict == Verdict::Localized);
     print::note(&format!("target {target}: {}", if found { "localized" } else { "not localized" }));
-    Ok(if found { Answer::Done } else { Answer::Negative })
+    Ok((located, if found { Answer::Done } else { Answer::Negative }))
 }
 
 /// The photo of that name, or the last by name.
@@ -70,7 +78,7 @@ fn find_target(wanted: Option<&str>, files: &[(String, std::path::PathBuf)]) -> 
 }
 
 /// Tab-separated: name, verdict, method, inliers, centre, rotation.
-pub fn line(method: &str, photo: &PhotoLocalization) -> String {
+fn line(method: &str, photo: &PhotoLocalization) -> String {
     let verdict = match photo.verdict {
         Verdict::Localized => "localized",
         Verdict::Uncertain => "uncertain",
@@ -84,7 +92,7 @@ pub fn line(method: &str, photo: &PhotoLocalization) -> String {
 }
 
 /// Poses, point cloud, COLMAP model, picture and report.
-pub fn write_results(
+fn write_results(
     folder: &Path,
     located: &Located,
     scene: &SceneFile,

@@ -58,6 +58,18 @@ pub struct RunResult {
     pub keys: BTreeMap<String, ContentHash>,
 }
 
+impl RunResult {
+    /// Adds what a further graph of the same command came to.
+    pub fn absorb(&mut self, other: Self) {
+        self.ran.extend(other.ran);
+        self.ran.sort();
+        self.ran.dedup();
+        self.hits += other.hits;
+        self.failed.extend(other.failed);
+        self.keys.extend(other.keys);
+    }
+}
+
 #[derive(Clone)]
 struct Slot {
     state: State,
@@ -128,13 +140,18 @@ impl<'a> Executor<'a> {
         self.options.observer.notice(&Event::Planned { jobs });
         rayon::scope(|scope| self.pump(scope));
         self.options.observer.notice(&Event::Ended);
-        let mut shared = self.lock();
-        if let Some(error) = shared.fatal.take() {
+        if let Some(error) = self.lock().fatal.take() {
             return Err(error);
         }
         if self.options.stop.load(Ordering::Relaxed) {
             return Err(Interrupted.into());
         }
+        Ok(self.result())
+    }
+
+    /// What the jobs came to so far.
+    pub fn result(&self) -> RunResult {
+        let shared = self.lock();
         let mut result = RunResult::default();
         for id in self.graph.graph.node_indices() {
             let (slot, label) = (&shared.slots[id.index()], self.graph.job(id).label());
@@ -149,7 +166,7 @@ impl<'a> Executor<'a> {
             }
         }
         result.ran.sort();
-        Ok(result)
+        result
     }
 
     /// Starts as many ready jobs as threads and memory allow, in the order they were added.
@@ -339,7 +356,11 @@ impl<'a> Executor<'a> {
         self.options.observer.notice(&Event::Warning { text });
         self.options.store.discard(output);
         let product: Product = (self.graph.job(id).work)(&Inputs { executor: self, id })?;
-        let again = self.options.store.write(&self.fingerprint(id), &product.file, 0.0)?;
+        if let Err(error) = self.options.store.write(&self.fingerprint(id), &product.file, 0.0) {
+            let text = format!("{label} was made again but cannot be kept: {error:#}");
+            self.options.observer.notice(&Event::Warning { text });
+        }
+        let again = ContentHash::of(&product.file);
         anyhow::ensure!(again == output, "{label} gives another result than before: run the command again");
         let slot = &mut self.lock().slots[id.index()];
         slot.state = State::Ran;
@@ -350,5 +371,114 @@ impl<'a> Executor<'a> {
     fn lock(&self) -> MutexGuard<'_, Shared> {
         // A panicking job never holds the lock while it changes anything by halves.
         self.shared.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::graph::{Broadcast, Job};
+    use crate::serde_artifact;
+
+    #[derive(serde::Serialize, serde::Deserialize)]
+    struct Number(u32);
+    serde_artifact!(Number, "number", 1);
+
+    type Work<'a> = &'a (dyn Fn() -> Result<Product> + Send + Sync);
+
+    fn job<'a>(name: &str, memory: u64, work: Work<'a>) -> Job<'a> {
+        Job {
+            kind: "test",
+            version: 1,
+            name: name.to_owned(),
+            params: json!(name),
+            external: BTreeMap::new(),
+            memory,
+            work: Box::new(move |_| work()),
+        }
+    }
+
+    fn run(graph: &JobGraph<'_>, store: &Store, stop: &AtomicBool) -> Result<RunResult> {
+        let observer = Broadcast::default();
+        let options = RunOptions { store, observer: &observer, threads: 4, memory: 100, stop };
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
+        pool.install(|| Executor::new(graph, &options).run())
+    }
+
+    fn store() -> (tempfile::TempDir, Store) {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).unwrap();
+        (folder, store)
+    }
+
+    #[test]
+    fn jobs_wait_for_memory_but_one_that_exceeds_it_runs_alone() {
+        let (_folder, store) = store();
+        let (used, most) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        let hold = |memory: usize| {
+            let now = used.fetch_add(memory, Ordering::SeqCst) + memory;
+            most.fetch_max(now, Ordering::SeqCst);
+            std::thread::sleep(std::time::Duration::from_millis(5));
+            used.fetch_sub(memory, Ordering::SeqCst);
+            Product::new(Number(0))
+        };
+        let (middle, large) = (|| hold(45), || hold(300));
+        let mut graph = JobGraph::default();
+        for at in 0..6 {
+            graph.add(job(&format!("middle {at}"), 45, &middle));
+        }
+        assert_eq!(run(&graph, &store, &AtomicBool::new(false)).unwrap().ran.len(), 6);
+        assert!(most.load(Ordering::SeqCst) <= 90, "{most:?}");
+        graph.add(job("large", 300, &large));
+        for at in 6..12 {
+            graph.add(job(&format!("middle {at}"), 45, &middle));
+        }
+        let again = run(&graph, &store, &AtomicBool::new(false)).unwrap();
+        assert_eq!((again.ran.len(), again.hits), (7, 6));
+        assert_eq!(most.load(Ordering::SeqCst), 300);
+    }
+
+    #[test]
+    fn a_failing_or_panicking_job_takes_along_only_those_that_require_it() {
+        let (_folder, store) = store();
+        let fails = || Err(anyhow::anyhow!("no light"));
+        let panics = || panic!("a bug");
+        let works = || Product::new(Number(1));
+        let mut graph = JobGraph::default();
+        let (bad, worse, good) = (
+            graph.add(job("bad", 1, &fails)),
+            graph.add(job("worse", 1, &panics)),
+            graph.add(job("good", 1, &works)),
+        );
+        let user = graph.add(job("requires bad", 1, &works));
+        graph.require(user, "a", bad);
+        let tolerant = graph.add(job("accepts worse", 1, &works));
+        graph.accept(tolerant, "a", worse);
+        graph.require(tolerant, "b", good);
+        let result = run(&graph, &store, &AtomicBool::new(false)).unwrap();
+        assert_eq!(result.ran, ["test accepts worse", "test good"]);
+        assert_eq!(result.failed["test bad"], "no light");
+        assert!(result.failed["test worse"].contains("panicked"), "{:?}", result.failed);
+        assert_eq!(result.keys.len(), 2);
+    }
+
+    #[test]
+    fn a_stop_lets_running_jobs_finish_and_starts_no_other() {
+        let (_folder, store) = store();
+        let stop = AtomicBool::new(false);
+        let stops = || {
+            stop.store(true, Ordering::Relaxed);
+            Product::new(Number(1))
+        };
+        let never = || panic!("it must not be started");
+        let mut graph = JobGraph::default();
+        let first = graph.add(job("first", 1, &stops));
+        let second = graph.add(job("second", 1, &never));
+        graph.require(second, "a", first);
+        assert!(run(&graph, &store, &stop).unwrap_err().is::<Interrupted>());
+        let again = graph.plan(&store, &crate::store::RunRecord::default());
+        assert_eq!(again[0].prediction, crate::graph::Prediction::Stored);
     }
 }

@@ -146,14 +146,26 @@ impl Inputs<'_, '_> {
             .with_context(|| format!("{} has no input {role}", self.executor.graph.job(self.id).label()))
     }
 
+    /// The content hash of the result in a role.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn hash(&self, role: &str) -> Result<ContentHash> {
+        self.used(role)
+            .and_then(|used| self.executor.output(used))
+            .with_context(|| format!("{} has no input {role}", self.executor.graph.job(self.id).label()))
+    }
+
+    fn used(&self, role: &str) -> Option<JobId> {
+        self.executor.graph.uses(self.id).find(|(_, edge)| edge.role == role).map(|(used, _)| used)
+    }
+
     /// The result in a role, or `None` when the job that makes it failed.
     ///
     /// # Errors
     /// When it can neither be read nor made again.
     pub fn find<T: Artifact>(&self, role: &str) -> Result<Option<Arc<T>>> {
-        let used =
-            self.executor.graph.uses(self.id).find(|(_, edge)| edge.role == role).map(|(used, _)| used);
-        match used {
+        match self.used(role) {
             Some(used) if self.executor.output(used).is_some() => self.executor.load(used).map(Some),
             _ => Ok(None),
         }

@@ -11,7 +11,6 @@ use super::derived_seed;
 use super::model::{ModelJobs, ModelKind, add_model};
 use crate::config::Config;
 use crate::dataset::SourceImage;
-use crate::fingerprint::ContentHash;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
 use crate::scene::SceneFile;
 use crate::stages;
@@ -21,8 +20,6 @@ use crate::stages;
 pub struct LocateJobs {
     /// The scene.
     pub scene: Arc<SceneFile>,
-    /// Its content hash.
-    pub scene_hash: ContentHash,
     /// Parameters.
     pub config: Config,
     /// Seed of everything random.
@@ -38,7 +35,7 @@ pub struct SetJobs {
     pub set: JobId,
 }
 
-/// Adds features, matches, local model and localization of a set.
+/// Adds features, matches, local model and localization of a set; `name` is what its jobs are called.
 ///
 /// # Errors
 /// When parameters have no JSON form.
@@ -59,7 +56,7 @@ pub fn add_set(
         version: stages::CAMSET_VERSION,
         name: name.to_owned(),
         params,
-        external: BTreeMap::from([("scene".to_owned(), what.scene_hash)]),
+        external: BTreeMap::from([("scene".to_owned(), what.scene.content)]),
         memory: 64 << 20,
         work: Box::new(work),
     });
@@ -110,7 +107,7 @@ pub fn add_single(
         version: stages::SINGLE_VERSION,
         name: photo.name.clone(),
         params,
-        external: BTreeMap::from([("scene".to_owned(), what.scene_hash)]),
+        external: BTreeMap::from([("scene".to_owned(), what.scene.content)]),
         memory: 32 << 20,
         work: Box::new(work),
     });

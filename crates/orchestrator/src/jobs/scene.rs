@@ -10,6 +10,7 @@ use setloc_sfm::{MapperOutput, Reconstruction};
 use super::model::{ModelJobs, ModelKind, add_model, image_of_place_holder, with_names};
 use crate::config::Config;
 use crate::dataset::SourceImage;
+use crate::fingerprint::ContentHash;
 use crate::geodesy::Wgs84;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
 use crate::scene::SceneFile;
@@ -64,7 +65,7 @@ pub fn add_scene(
         graph.accept(index, format!("features {at:04}"), *features);
     }
     let names: Vec<String> = images.iter().map(|image| image.name.clone()).collect();
-    let config = config.to_toml()?;
+    let config = config.scene_toml()?;
     let params = json!({ "names": names, "origin": origin, "config": config });
     let scene_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
@@ -75,11 +76,12 @@ pub fn add_scene(
             origin: output.report.georegistration.as_ref().and(origin),
             warnings: output.report.warnings.iter().map(|text| with_names(text, &names)).collect(),
             config: config.clone(),
+            content: ContentHash::of_all(&[inputs.hash("model")?, inputs.hash("index")?]),
         })
     };
     let scene = graph.add(Job {
         kind: "scene",
-        version: 1,
+        version: stages::SCENE_VERSION,
         name: "scene".to_owned(),
         params,
         external: BTreeMap::new(),

@@ -1,14 +1,15 @@
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{LineWriter, Write};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 
 use crate::graph::{Event, Observer};
+use crate::store::write_error;
 
-/// One JSON object a line for each event.
-pub struct JsonLog(Mutex<BufWriter<File>>);
+/// One JSON object a line for each event, written at once: a killed run leaves its log.
+pub struct JsonLog(Mutex<LineWriter<File>>);
 
 impl JsonLog {
     /// Begins a log in a new file.
@@ -16,8 +17,8 @@ impl JsonLog {
     /// # Errors
     /// When the file cannot be made.
     pub fn create(path: &Path) -> Result<Self> {
-        let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
-        Ok(Self(Mutex::new(BufWriter::new(file))))
+        let file = File::create(path).map_err(|error| write_error(error, path))?;
+        Ok(Self(Mutex::new(LineWriter::new(file))))
     }
 }
 
@@ -27,9 +28,6 @@ impl Observer for JsonLog {
         // The log is for people; a full disk shows where results are written.
         if let Ok(line) = serde_json::to_string(event) {
             let _ = writeln!(file, "{line}");
-        }
-        if *event == Event::Ended {
-            let _ = file.flush();
         }
     }
 }

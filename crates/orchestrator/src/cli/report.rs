@@ -1,0 +1,20 @@
+use anyhow::Result;
+
+use super::Answer;
+use super::args::ReportArgs;
+use super::build::export_folder;
+use crate::digest::Digest;
+use crate::print;
+use crate::store::write_atomically;
+
+/// `setloc report`
+pub fn run(args: &ReportArgs) -> Result<Answer> {
+    // Of a scene file: what `build` wrote beside it.
+    let folder = if args.results.is_file() { export_folder(&args.results) } else { args.results.clone() };
+    let digest = Digest::read(&folder)?;
+    let page = args.output.clone().unwrap_or_else(|| folder.join("report.html"));
+    write_atomically(&page, digest.to_html().as_bytes())?;
+    print::data(digest.to_text().trim_end());
+    print::note(&format!("wrote {}", page.display()));
+    Ok(Answer::Done)
+}

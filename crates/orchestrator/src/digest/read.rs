@@ -1,0 +1,213 @@
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use serde::Deserialize;
+use serde::de::IgnoredAny;
+use setloc_camset::Verdict;
+
+use super::{Digest, ImageRow, Standing};
+use crate::dataset::SkippedImage;
+use crate::error::Hinted;
+use crate::subscribers::StageReport;
+
+/// An image of a scene with fewer observations than this share of the median is named as weak.
+const WEAK_SHARE: f64 = 0.2;
+
+/// `poses.json` of either command.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Poses {
+    Scene(ScenePoses),
+    Located(LocatedPoses),
+}
+
+#[derive(Deserialize)]
+struct ScenePoses {
+    components: Vec<Component>,
+    warnings: Vec<String>,
+}
+
+#[derive(Deserialize)]
+struct Component {
+    points: usize,
+    observations: usize,
+    images: Vec<SceneImage>,
+}
+
+#[derive(Deserialize)]
+struct SceneImage {
+    name: String,
+    world_from_camera: Option<IgnoredAny>,
+    observations: usize,
+}
+
+#[derive(Deserialize)]
+struct LocatedPoses {
+    target: String,
+    photos: Vec<Photo>,
+    advice: Option<Vec<String>>,
+    skipped: Vec<SkippedImage>,
+}
+
+#[derive(Deserialize)]
+struct Photo {
+    name: String,
+    verdict: Verdict,
+    method: String,
+    inliers: usize,
+    reasons: Vec<String>,
+    sigma: Option<Sigma>,
+}
+
+#[derive(Deserialize)]
+struct Sigma {
+    rotation_deg: f64,
+    position: f64,
+}
+
+/// `report.json`; a folder without one has no times.
+#[derive(Default, Deserialize)]
+struct Report {
+    stages: Vec<StageReport>,
+    #[serde(default)]
+    skipped: Vec<SkippedImage>,
+}
+
+impl Digest {
+    /// Reads an output folder of `build` or `locate`.
+    ///
+    /// # Errors
+    /// When it is none, or a file of it is damaged.
+    pub fn read(folder: &Path) -> Result<Self> {
+        let file = folder.join("poses.json");
+        let bytes = std::fs::read(&file).map_err(|error| {
+            let error = anyhow::Error::new(error).context(format!("cannot read {}", file.display()));
+            Hinted::wrap(error, "name the output folder of `setloc build` or `setloc locate`")
+        })?;
+        let poses = serde_json::from_slice(&bytes).map_err(|error| {
+            let error = anyhow::Error::new(error)
+                .context(format!("{} holds no results of `build` or `locate`", file.display()));
+            Hinted::wrap(error, "run the command again that wrote it")
+        })?;
+        let file = folder.join("report.json");
+        let report = match std::fs::read(&file) {
+            Ok(bytes) => serde_json::from_slice(&bytes)
+                .with_context(|| format!("{} is no report of a run", file.display()))?,
+            Err(_) => Report::default(),
+        };
+        let title = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+        let title = title.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        let digest = match poses {
+            Poses::Scene(scene) => of_scene(&title, scene, report.skipped),
+            Poses::Located(located) => of_photos(&title, located),
+        };
+        Ok(Self {
+            stages: report.stages,
+            top_view: std::fs::read(folder.join("top_view.png")).ok(),
+            ..digest
+        })
+    }
+}
+
+fn of_scene(name: &str, scene: ScenePoses, skipped: Vec<SkippedImage>) -> Digest {
+    let Some(main) = scene.components.first() else {
+        return Digest {
+            title: format!("Scene {name}"),
+            headline: "No image could be registered.".to_owned(),
+            warnings: scene.warnings,
+            advice: vec!["take panoramas closer to each other (3 to 10 m)".to_owned()],
+            skipped,
+            ..Digest::default()
+        };
+    };
+    let registered = main.images.iter().filter(|image| image.world_from_camera.is_some()).count();
+    let mut observations: Vec<usize> = main.images.iter().map(|image| image.observations).collect();
+    observations.sort_unstable();
+    let least = WEAK_SHARE * observations.get(observations.len() / 2).map_or(0.0, |&median| median as f64);
+    let row = |image: &SceneImage| {
+        let (standing, verdict) = match &image.world_from_camera {
+            None => (Standing::Bad, "not registered"),
+            Some(_) if (image.observations as f64) < least => (Standing::Weak, "weakly tied"),
+            Some(_) => (Standing::Good, "registered"),
+        };
+        ImageRow {
+            name: image.name.clone(),
+            standing,
+            verdict: verdict.to_owned(),
+            evidence: format!("{} observations", image.observations),
+            reasons: Vec::new(),
+            is_target: false,
+        }
+    };
+    let images: Vec<ImageRow> = main.images.iter().map(row).collect();
+    let of_standing = |standing| {
+        let names = images.iter().filter(|image| image.standing == standing).map(|image| image.name.as_str());
+        names.collect::<Vec<_>>().join(", ")
+    };
+    let (lost, weak) = (of_standing(Standing::Bad), of_standing(Standing::Weak));
+    let mut advice = Vec::new();
+    if !lost.is_empty() {
+        advice
+            .push(format!("not registered: {lost}; panoramas between them and the others would tie them in"));
+    }
+    if !weak.is_empty() {
+        advice.push(format!("weakly tied: {weak}; panoramas beside them would make them firm"));
+    }
+    if scene.components.len() > 1 {
+        advice.push(format!(
+            "the scene falls into {} parts, of which only the largest is used: panoramas between them would join them",
+            scene.components.len()
+        ));
+    }
+    Digest {
+        title: format!("Scene {name}"),
+        headline: format!(
+            "{registered} of {} images registered, {} points, {} observations.",
+            main.images.len(),
+            main.points,
+            main.observations
+        ),
+        warnings: scene.warnings,
+        advice,
+        images,
+        skipped,
+        ..Digest::default()
+    }
+}
+
+fn of_photos(name: &str, located: LocatedPoses) -> Digest {
+    let row = |photo: Photo| {
+        let (standing, verdict) = match photo.verdict {
+            Verdict::Localized => (Standing::Good, "localized"),
+            Verdict::Uncertain => (Standing::Weak, "uncertain"),
+            Verdict::NotLocalized => (Standing::Bad, "not localized"),
+        };
+        let precision = photo.sigma.map_or_else(String::new, |sigma| {
+            format!(", σ {:.3} and {:.3}°", sigma.position, sigma.rotation_deg)
+        });
+        ImageRow {
+            is_target: photo.name == located.target,
+            name: photo.name,
+            standing,
+            verdict: verdict.to_owned(),
+            evidence: format!("{}, {} inliers{precision}", photo.method, photo.inliers),
+            reasons: photo.reasons,
+        }
+    };
+    let images: Vec<ImageRow> = located.photos.into_iter().map(row).collect();
+    let localized = images.iter().filter(|image| image.standing == Standing::Good).count();
+    let target =
+        images.iter().find(|image| image.is_target).map_or("without an answer", |image| &image.verdict);
+    Digest {
+        title: format!("Photos {name}"),
+        headline: format!(
+            "Target {}: {target}. {localized} of {} photos localized.",
+            located.target,
+            images.len()
+        ),
+        advice: located.advice.unwrap_or_default(),
+        images,
+        skipped: located.skipped,
+        ..Digest::default()
+    }
+}

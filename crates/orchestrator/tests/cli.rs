@@ -1,0 +1,129 @@
+//! What the program says: help, errors with their hints, reports. `INSTA_UPDATE=always` accepts new texts.
+
+#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
+
+mod common;
+
+use common::{gave, panoramas, said, setloc, town};
+
+#[test]
+fn help_says_what_there_is() {
+    let folder = tempfile::tempdir().unwrap();
+    let commands = [
+        "", "demo", "build", "plan", "locate", "bench", "batch", "report", "status", "export", "import",
+        "explain", "cache", "cache gc",
+    ];
+    for command in commands {
+        let arguments: Vec<&str> = command.split_whitespace().chain(["--help"]).collect();
+        let output = setloc(folder.path(), &arguments);
+        assert_eq!(output.status.code(), Some(0));
+        let name = format!("help {command}").trim().replace(' ', "-");
+        insta::assert_snapshot!(name, gave(&output));
+    }
+}
+
+#[test]
+fn errors_name_the_file_the_place_and_the_remedy() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    std::fs::create_dir(folder.path().join("empty")).unwrap();
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    write("config.toml", "[camset]\nrato = 0.6\n");
+    write("geo.csv", "name,lat,lon,alt\np0.png,91,8,0\n");
+    write("damaged.setloc", "SETLOC");
+    write("batch.toml", "[[scene]]\nname = \"a\"\n");
+    let wrong: [&[&str]; 15] = [
+        &["build"],
+        &["build", "nowhere"],
+        &["build", "empty"],
+        &["build", "panoramas", "--config", "config.toml"],
+        &["build", "panoramas", "--set", "camset.ratio"],
+        &["build", "panoramas", "--set", "camset.rato=1"],
+        &["build", "panoramas", "--gps", "geo.csv"],
+        &["build", "panoramas", "--memory", "8 apples"],
+        &["locate", "missing.setloc", "panoramas"],
+        &["locate", "damaged.setloc", "panoramas"],
+        &["explain", "features"],
+        &["cache", "ls", "--cache", "nowhere"],
+        &["report", "empty"],
+        &["batch", "batch.toml"],
+        &["bench", "empty"],
+    ];
+    let mut texts = String::new();
+    for arguments in wrong {
+        let output = setloc(folder.path(), arguments);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}");
+        assert!(output.stdout.is_empty(), "{arguments:?}");
+        texts += &["$ setloc ", &arguments.join(" "), "\n", &said(&output), "\n"].concat();
+    }
+    let here = folder.path().canonicalize().unwrap().display().to_string();
+    // The parameters of the stages are those crates' own affair.
+    insta::with_settings!({ filters => vec![(r"expected one of `.*", "expected one of […]")] }, {
+        insta::assert_snapshot!("errors", texts.replace(&here, "[here]"));
+    });
+}
+
+#[test]
+fn report_and_status_tell_what_came_out() {
+    let folder = tempfile::tempdir().unwrap();
+    town(folder.path());
+    let run = |arguments: &[&str]| setloc(folder.path(), arguments);
+    let cameras = ["--cameras", "town/cameras.json"];
+    let build = run(&[&["build", "town/panoramas", "-o", "s.setloc"], &cameras[..]].concat());
+    assert_eq!(build.status.code(), Some(0), "{}", said(&build));
+    let locate = run(&[&["locate", "s.setloc", "town/queries/lane", "-o", "out"], &cameras[..]].concat());
+    assert!(matches!(locate.status.code(), Some(0 | 1)), "{}", said(&locate));
+
+    let of_scene = run(&["report", "s.setloc"]);
+    assert_eq!(of_scene.status.code(), Some(0), "{}", said(&of_scene));
+    assert!(gave(&of_scene).contains("4 of 4 images registered"), "{}", gave(&of_scene));
+    let of_photos = run(&["report", "out", "-o", "page.html"]);
+    let text = gave(&of_photos);
+    assert!(text.contains("Target lane/img_03.jpg") && text.contains("lane/img_00.jpg\t"), "{text}");
+    for page in ["s/report.html", "page.html"] {
+        let page = std::fs::read_to_string(folder.path().join(page)).unwrap();
+        assert!(page.contains("data:image/png;base64,") && page.contains("<svg") && !page.contains("href="));
+    }
+
+    let status = gave(&run(&["status"]));
+    assert!(status.contains("build s.setloc: ") && status.contains("locate out: "), "{status}");
+    assert!(
+        status.contains("jobs ran, 0 were stored, 0 failed") && status.contains("features\t8"),
+        "{status}"
+    );
+}
+
+#[test]
+fn plan_and_explain_name_the_parameter_that_changed() {
+    let folder = tempfile::tempdir().unwrap();
+    town(folder.path());
+    let run = |command: &[&str], settings: &[&str]| {
+        let output = setloc(folder.path(), &[command, settings].concat());
+        assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+        gave(&output)
+    };
+    let (plan, build) =
+        (["plan", "town/panoramas", "-o", "s.setloc"], ["build", "town/panoramas", "-o", "s.setloc"]);
+    assert!(run(&plan, &[]).contains("runs     features panoramas/pano_000.jpg: never ran before"));
+    assert!(!folder.path().join(".setloc-cache").exists(), "a plan makes nothing");
+    run(&build, &[]);
+    assert!(run(&plan, &[]).ends_with("0 jobs run, 0 depend on them, 19 are stored\n"));
+    let changed = ["--set", "two_view.min_inliers=40"];
+    let reason = "parameter two_view.min_inliers changed from ";
+    let planned = run(&plan, &changed);
+    assert_eq!(
+        planned.lines().filter(|line| line.starts_with("runs     verify ") && line.contains(reason)).count(),
+        6
+    );
+    assert!(planned.contains("follows  model scene: uses verify "), "{planned}");
+    run(&build, &changed);
+    let explained = run(&["explain", "verify panoramas/pano_000.jpg"], &[]);
+    assert!(
+        explained.lines().count() == 3 && explained.lines().all(|line| line.contains(reason)),
+        "{explained}"
+    );
+    assert!(run(&["explain", "features"], &[]).lines().all(|line| line.ends_with(": nothing changed")));
+    // Another output in the same store is another run.
+    run(&["build", "town/panoramas", "-o", "other/s.setloc"], &["--cache", ".setloc-cache"]);
+    assert!(run(&["explain", "features"], &[]).contains("build other/s.setloc: features"));
+}
