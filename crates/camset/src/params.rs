@@ -27,8 +27,8 @@ impl Default for VerdictParams {
             min_cells: 5,
             max_log10_false_alarms: -6.0,
             max_runner_up: 0.5,
-            max_center_sigma: 0.05,
-            max_rotation_sigma_rad: 0.035,
+            max_center_sigma: 0.02,
+            max_rotation_sigma_rad: 0.009,
             min_link: 12,
         }
     }

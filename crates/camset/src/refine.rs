@@ -1,8 +1,8 @@
-//! Bundle problems over photos whose scene points stay fixed.
+//! Bundle problems over photos in a scene whose cameras stay fixed.
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector2, Vector3};
 use setloc_features::Camera;
 use setloc_index::SceneIndex;
 use setloc_sfm::bundle::{
@@ -14,7 +14,7 @@ use setloc_sfm::{PointId, Rigid};
 use crate::evidence::{PhotoRays, SceneMatch};
 
 /// Scale of the robust loss in standard deviations: inliers (up to four) hardly feel it, leftovers do.
-const LOSS_SCALE: f64 = 3.0;
+const LOSS_SCALE: f64 = 1.0;
 /// Observations that a photo needs before its intrinsics are estimated.
 const MIN_FOR_INTRINSICS: usize = 30;
 
@@ -44,7 +44,8 @@ pub(crate) struct TrackObservation {
     pub point: usize,
 }
 
-/// Moves photos and local points (the paper's T_OPT), scene points fixed; returns covariances of the poses if asked.
+/// Moves photos and local points (the paper's T_OPT), scene points within what the scene knows of them; returns
+/// covariances of the poses if asked.
 ///
 /// `direct[i]` are the scene points that photo `i` sees. A camera is estimated only when it is not known and enough
 /// observations support it. Poses without any observation stay where they are.
@@ -66,14 +67,14 @@ pub(crate) fn refine_jointly(
         let photo = &model.photos[slot];
         for &found in matches {
             let point = *scene_points.entry(found.point).or_insert_with(|| {
-                points.push(BundlePoint { position: index.position(found.point), fixed: true });
+                points.push(BundlePoint { position: index.position(found.point), fixed: false });
                 points.len() as u32 - 1
             });
             observations.push(BundleObservation {
                 pose: slot as u32,
                 point,
                 pixel: rays[slot].features.keypoints[found.feature as usize].pixel(),
-                noise_px: rays[slot].match_noise_px(index, &photo.world_from_camera, found),
+                noise_px: f64::from(rays[slot].features.keypoints[found.feature as usize].noise_px),
             });
         }
         support[photo.camera] += matches.len();
@@ -101,7 +102,7 @@ pub(crate) fn refine_jointly(
             }
         })
         .collect();
-    let poses = model
+    let mut poses: Vec<BundlePose> = model
         .photos
         .iter()
         .zip(&observed)
@@ -111,17 +112,29 @@ pub(crate) fn refine_jointly(
             fixed: observed < 3,
         })
         .collect();
-    let mut problem = BundleProblem {
-        cameras: model.cameras.clone(),
-        camera_freedom,
-        poses,
-        points,
-        observations,
-        position_priors: Vec::new(),
-    };
+    let mut cameras = model.cameras.clone();
+    cameras.push(Camera::equirectangular(FAR_WIDTH, FAR_WIDTH / 2));
+    for (&scene_point, &point) in &scene_points {
+        let covariance = index.position_covariance(scene_point);
+        for prior in prior_bearings(&index.position(scene_point), &covariance) {
+            let pose = poses.len() as u32;
+            let camera = model.cameras.len() as u32;
+            poses.push(BundlePose { camera, world_from_camera: prior.world_from_camera, fixed: true });
+            observations.push(BundleObservation {
+                pose,
+                point,
+                pixel: prior.pixel,
+                noise_px: prior.noise_px,
+            });
+        }
+    }
+    let mut problem =
+        BundleProblem { cameras, camera_freedom, poses, points, observations, position_priors: Vec::new() };
     let params = BundleParams { loss: RobustLoss::Cauchy(LOSS_SCALE), ..BundleParams::default() };
     let _report = bundle::solve(&params, &mut problem);
-    model.cameras.clone_from(&problem.cameras);
+    for (camera, refined) in model.cameras.iter_mut().zip(&problem.cameras) {
+        camera.clone_from(refined);
+    }
     for (photo, pose) in model.photos.iter_mut().zip(&problem.poses) {
         photo.world_from_camera = pose.world_from_camera;
     }
@@ -132,34 +145,110 @@ pub(crate) fn refine_jointly(
         return vec![None; model.photos.len()];
     }
     // What is left are inliers: each counts in full.
-    covariances(&problem, RobustLoss::Trivial)
+    covariances(&problem, model.photos.len(), RobustLoss::Trivial)
 }
 
-/// Covariances of all poses; where the whole is undetermined, of those that their fixed points determine alone.
-fn covariances(problem: &BundleProblem, loss: RobustLoss) -> Vec<Option<Matrix6<f64>>> {
-    let wanted: Vec<u32> =
-        (0..problem.poses.len() as u32).filter(|&pose| !problem.poses[pose as usize].fixed).collect();
-    let mut found = vec![None; problem.poses.len()];
+/// Width in pixels of the far cameras' images; their pixels only express angles.
+const FAR_WIDTH: u32 = 4096;
+/// Distance of the far cameras from their point, in its largest standard deviations.
+const FAR: f64 = 1e3;
+
+/// A camera far off that sees a scene point in the middle of its image.
+struct PriorBearing {
+    world_from_camera: Rigid,
+    pixel: Vector2<f64>,
+    noise_px: f64,
+}
+
+/// What the scene knows of a point, as bearings from far off along the axes of its covariance.
+///
+/// Scene points are not exact: those at the rim were seen from a few panoramas in a row, and their depths can be off
+/// by percents, the same way for a whole façade. Taken as fixed they bend the scale of the set to themselves, and the
+/// covariance does not show it. A bearing from far along axis k with weight w_k tells the place across that axis only;
+/// three of them sum up to the information Σ⁻¹ when w_k = (Σ_j i_j)/2 − i_k for the information i_j along axis j. An
+/// axis that is known better than the other two together counts as they do, since no weight is negative.
+fn prior_bearings(position: &Vector3<f64>, covariance: &Matrix3<f64>) -> Vec<PriorBearing> {
+    let eigen = covariance.symmetric_eigen();
+    let largest = eigen.eigenvalues.max();
+    if !(largest > 0.0) || !largest.is_finite() {
+        return Vec::new();
+    }
+    let information = eigen.eigenvalues.map(|variance| 1.0 / variance.max(1e-6 * largest));
+    let all = information.sum();
+    let information = information.map(|along| along.min(all - along));
+    let distance = FAR * largest.sqrt();
+    let pixel_angle = std::f64::consts::TAU / f64::from(FAR_WIDTH);
+    (0..3)
+        .filter_map(|axis| {
+            let weight = information.sum() / 2.0 - information[axis];
+            let away = eigen.eigenvectors.column(axis).into_owned();
+            let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &-away)
+                .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
+            (weight > 0.0).then(|| PriorBearing {
+                world_from_camera: Rigid::new(rotation, position + away * distance),
+                pixel: Vector2::new(f64::from(FAR_WIDTH) / 2.0, f64::from(FAR_WIDTH) / 4.0),
+                noise_px: 1.0 / (weight.sqrt() * distance * pixel_angle),
+            })
+        })
+        .collect()
+}
+
+/// Covariances of the photos' poses; where the whole is undetermined, of those that scene points determine alone.
+fn covariances(problem: &BundleProblem, photos: usize, loss: RobustLoss) -> Vec<Option<Matrix6<f64>>> {
+    let wanted: Vec<u32> = (0..photos as u32).filter(|&pose| !problem.poses[pose as usize].fixed).collect();
+    let mut found = vec![None; photos];
     if let Some(covariances) = bundle::covariance(problem, loss, &wanted) {
         for (&pose, covariance) in wanted.iter().zip(covariances) {
             found[pose as usize] = Some(covariance);
         }
         return found;
     }
+    let mut of_scene = vec![false; problem.points.len()];
+    for prior in problem.observations.iter().filter(|o| o.pose as usize >= photos) {
+        of_scene[prior.point as usize] = true;
+    }
     for &pose in &wanted {
-        let ties = |o: &&BundleObservation| o.pose == pose && problem.points[o.point as usize].fixed;
-        let observations: Vec<BundleObservation> =
-            problem.observations.iter().filter(ties).map(|o| BundleObservation { pose: 0, ..*o }).collect();
-        let alone = BundleProblem {
-            cameras: problem.cameras.clone(),
-            camera_freedom: problem.camera_freedom.clone(),
-            poses: vec![problem.poses[pose as usize]],
-            points: problem.points.clone(),
-            observations,
-            position_priors: Vec::new(),
+        let ties = |o: &&BundleObservation| {
+            of_scene[o.point as usize] && (o.pose == pose || o.pose as usize >= photos)
         };
-        let covariance = bundle::covariance(&alone, loss, &[0]);
+        // Only this pose and the far cameras keep observations, so the others drop out.
+        let alone = BundleProblem {
+            observations: problem.observations.iter().filter(ties).copied().collect(),
+            ..problem.clone()
+        };
+        let covariance = bundle::covariance(&alone, loss, &[pose]);
         found[pose as usize] = covariance.and_then(|covariances| covariances.first().copied());
     }
     found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn far_bearings_carry_the_information_of_the_covariance() {
+        let axes = UnitQuaternion::from_euler_angles(0.3, -0.8, 1.2).to_rotation_matrix().into_inner();
+        let covariance = axes * Matrix3::from_diagonal(&Vector3::new(1e-4, 1.05e-4, 9e-4)) * axes.transpose();
+        let position = Vector3::new(3.0, -1.0, 12.0);
+        let camera = Camera::equirectangular(FAR_WIDTH, FAR_WIDTH / 2);
+        let mut information = Matrix3::zeros();
+        for prior in prior_bearings(&position, &covariance) {
+            let seen = camera.unproject(&prior.pixel).unwrap();
+            let offset = position - prior.world_from_camera.translation;
+            let direction = offset.normalize();
+            assert!((prior.world_from_camera.rotation * seen - direction).norm() < 1e-9);
+            let sigma = prior.noise_px * camera.pixel_angle(&prior.pixel).unwrap() * offset.norm();
+            information += (Matrix3::identity() - direction * direction.transpose()) / (sigma * sigma);
+        }
+        let expected = covariance.try_inverse().unwrap();
+        assert!((information - expected).norm() < 1e-6 * expected.norm(), "{information} {expected}");
+    }
+
+    #[test]
+    fn a_point_that_is_exact_or_unknown_has_no_bearings() {
+        for covariance in [Matrix3::zeros(), Matrix3::repeat(f64::NAN), Matrix3::identity() * f64::INFINITY] {
+            assert!(prior_bearings(&Vector3::zeros(), &covariance).is_empty());
+        }
+    }
 }

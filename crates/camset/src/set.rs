@@ -11,6 +11,7 @@ use setloc_index::NearestPoints;
 use setloc_sfm::{ImageId, Reconstruction};
 
 use crate::advice::widest_paths;
+use crate::evidence::SceneMatch;
 use crate::single::locate_with_nearest;
 use crate::{CamsetParams, PhotoLocalization, QueryPhoto, Scene, SetLocalization, Verdict};
 
@@ -22,6 +23,8 @@ pub(crate) struct PhotoEvidence {
     nearest: Vec<NearestPoints>,
     /// The photo alone.
     alone: PhotoLocalization,
+    /// The scene points that it sees from there.
+    seen: Vec<SceneMatch>,
 }
 
 /// Localizes a set through its local models (components of the photos' own reconstruction, largest first).
@@ -42,8 +45,8 @@ pub fn locate_set(
         .map(|(number, photo)| {
             let nearest = scene.index.nearest_points(&photo.features.descriptors);
             let seed = seed.wrapping_add(number as u64);
-            let alone = locate_with_nearest(&params.single, scene, photo, &nearest, seed);
-            PhotoEvidence { nearest, alone }
+            let (alone, seen) = locate_with_nearest(&params.single, scene, photo, &nearest, seed);
+            PhotoEvidence { nearest, alone, seen }
         })
         .collect();
     let mut answer = SetLocalization::default();

@@ -43,20 +43,22 @@ pub fn locate_single(
     seed: u64,
 ) -> PhotoLocalization {
     let nearest = scene.index.nearest_points(&photo.features.descriptors);
-    locate_with_nearest(params, scene, photo, &nearest, seed)
+    locate_with_nearest(params, scene, photo, &nearest, seed).0
 }
 
-/// [`locate_single`] where the nearest scene points of all features are already known.
+/// [`locate_single`] where the nearest scene points of all features are already known, with the matches that agree.
 pub(crate) fn locate_with_nearest(
     params: &SingleParams,
     scene: &Scene<'_>,
     photo: &QueryPhoto<'_>,
     nearest: &[NearestPoints],
     seed: u64,
-) -> PhotoLocalization {
+) -> (PhotoLocalization, Vec<SceneMatch>) {
+    // Simulated views tie photos to each other, and help once a pose is known. Before, they add less to a scene of which
+    // each point was seen from several sides than the chance matches of so many more features take away.
     let matches: Vec<SceneMatch> = scene
         .index
-        .correspondences(nearest, params.ratio)
+        .correspondences(&nearest[..photo.features.own_len()], params.ratio)
         .into_iter()
         .map(|c| SceneMatch { feature: c.feature, point: c.point })
         .collect();
@@ -66,24 +68,24 @@ pub(crate) fn locate_with_nearest(
             matches.len(),
             params.verdict.min_inliers
         );
-        return PhotoLocalization::not_localized(photo, reason);
+        return (PhotoLocalization::not_localized(photo, reason), Vec::new());
     }
     let Some(found) = solve(params, scene, photo, nearest, &matches, seed) else {
         let reason = format!("no pose explains any of its {} matches to the scene", matches.len());
-        return PhotoLocalization::not_localized(photo, reason);
+        return (PhotoLocalization::not_localized(photo, reason), Vec::new());
     };
     let mut reasons = Vec::new();
     let mut verdict = judge_support(&params.verdict, &found.evidence, &mut reasons);
     if verdict == Verdict::NotLocalized {
         let mut refused = PhotoLocalization::not_localized(photo, String::new());
         (refused.reasons, refused.inliers) = (reasons, found.evidence.inliers);
-        return refused;
+        return (refused, Vec::new());
     }
     verdict = weaker(
         verdict,
         judge_precision(&params.verdict, found.covariance.as_ref(), found.depth, &mut reasons),
     );
-    PhotoLocalization {
+    let answer = PhotoLocalization {
         name: photo.name.to_owned(),
         camera: found.camera,
         world_from_camera: Some(found.world_from_camera),
@@ -91,7 +93,8 @@ pub(crate) fn locate_with_nearest(
         inliers: found.inliers.len(),
         verdict,
         reasons,
-    }
+    };
+    (answer, found.inliers)
 }
 
 struct Hypothesis {

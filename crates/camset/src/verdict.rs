@@ -129,7 +129,7 @@ mod tests {
         let judge = |covariance: Option<Matrix6<f64>>| {
             judge_precision(&params, covariance.as_ref(), 10.0, &mut Vec::new())
         };
-        assert_eq!(judge(Some(Matrix6::identity() * 1e-4)), Verdict::Localized);
+        assert_eq!(judge(Some(Matrix6::identity() * 1e-5)), Verdict::Localized);
         assert_eq!(judge(Some(Matrix6::identity())), Verdict::Uncertain);
         assert_eq!(judge(Some(Matrix6::repeat(f64::NAN))), Verdict::Uncertain);
         assert_eq!(judge(None), Verdict::Uncertain);

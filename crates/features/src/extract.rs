@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::error::check;
 use crate::sift::{self, SiftParams, SiftPoint, detect_and_describe};
 use crate::{
-    Camera, DESCRIPTOR_LEN, DESCRIPTOR_NORM, DecodedImage, FeatureError, ImageFeatures, Keypoint, Mask,
+    Camera, DESCRIPTOR_NORM, DecodedImage, FeatureError, ImageFeatures, Keypoint, Mask, SimulatedView,
 };
 
 /// How to detect and describe points.
@@ -31,14 +31,21 @@ pub struct FeatureParams {
     pub even_share: f64,
     /// Half angle in degrees of a cone about straight down that gives no keypoints (car, tripod); panoramas only.
     pub nadir_cone_deg: f64,
+    /// Tilt whose view of the surfaces is simulated besides the image itself: points are also detected in the image
+    /// squeezed by this factor along x, and along y. 1 simulates none.
+    ///
+    /// SIFT bears about 45° between the directions of sight; a wall seen straight on and the same wall seen along the
+    /// street differ by far more. Squeezing one of the two photos makes up for it (J.-M. Morel, G. Yu, "ASIFT: A new
+    /// framework for fully affine invariant image comparison", SIAM J. Imaging Sciences 2009). A tilt of 2 is 60°.
+    pub simulated_tilt: f64,
 }
 
 impl FeatureParams {
     /// Changes whenever the same parameters and pixels give other features.
     ///
     /// 1: OpenCV SIFT, RootSIFT u8, half-pixel corrected, seam padded, spread over the sphere.
-    /// 2: own SIFT, bright and dark spots apart.
-    pub const VERSION: u32 = 2;
+    /// 2: own SIFT, bright and dark spots apart. 3: simulated views.
+    pub const VERSION: u32 = 3;
 
     /// Checks the ranges.
     ///
@@ -63,7 +70,9 @@ impl FeatureParams {
             self.nadir_cone_deg,
             "in [0, 90]",
             (0.0..=90.0).contains(&self.nadir_cone_deg),
-        )
+        )?;
+        let in_range = (1.0..=8.0).contains(&self.simulated_tilt);
+        check("simulated_tilt", self.simulated_tilt, "in [1, 8]", in_range)
     }
 }
 
@@ -78,6 +87,7 @@ impl Default for FeatureParams {
             sigma_px: 1.6,
             even_share: 0.6,
             nadir_cone_deg: 0.0,
+            simulated_tilt: 1.0,
         }
     }
 }
@@ -122,68 +132,97 @@ pub fn extract(
         });
     }
     let grey = Grey::new(image).reduced(params.max_side)?;
-    let scale_x = width as f32 / grey.width as f32;
-    let scale_y = height as f32 / grey.height as f32;
     let padding = if camera.wraps_around() { grey.width / SEAM_SHARE } else { 0 };
+    let scale = [width as f32 / grey.width as f32, height as f32 / grey.height as f32];
     let grey = grey.wrapped(padding);
-    let sift = SiftParams {
-        contrast_threshold: params.contrast_threshold,
-        edge_threshold: params.edge_threshold,
-        octave_layers: params.octave_layers as usize,
-        sigma_px: params.sigma_px,
-    };
-    let in_image = |x: f32, y: f32| ((x - padding as f32) * scale_x, y * scale_y);
-    let nadir = (params.nadir_cone_deg > 0.0 && camera.is_panoramic())
-        .then(|| params.nadir_cone_deg.to_radians().cos());
-    let allows = |x: f32, y: f32| {
-        let (x, y) = in_image(x, y);
-        let inside = (0.0..width as f32).contains(&x) && (0.0..height as f32).contains(&y);
-        let ray = || camera.unproject(&nalgebra::Vector2::new(x.into(), y.into()));
-        inside
-            && mask.is_none_or(|mask| mask.allows(x, y, width, height))
-            && nadir.is_none_or(|limit| ray().is_none_or(|ray| ray.y < limit))
-    };
-    let choose = |points: &[SiftPoint]| {
-        let candidate = |(index, point): (usize, &SiftPoint)| {
-            let (x, y) = in_image(point.x, point.y);
-            Candidate { index, x, y, response: point.response, is_light: point.is_light }
-        };
-        let mut candidates: Vec<Candidate> = points.iter().enumerate().map(candidate).collect();
-        // A total order, so that the choice does not depend on the detector's.
-        candidates.sort_by(|a, b| {
-            b.response
-                .total_cmp(&a.response)
-                .then(a.y.total_cmp(&b.y))
-                .then(a.x.total_cmp(&b.x))
-                .then(a.index.cmp(&b.index))
-        });
-        let mut chosen = choose(params, camera, &candidates);
-        chosen.sort_by_key(|candidate| !candidate.is_light);
-        chosen.iter().map(|candidate| candidate.index).collect()
-    };
-    let (points, descriptors) = detect_and_describe(&sift, grey.view(), allows, choose);
-    let mut features = ImageFeatures {
-        width,
-        height,
-        light: points.iter().filter(|point| point.is_light).count() as u32,
-        keypoints: Vec::with_capacity(points.len()),
-        descriptors: Vec::with_capacity(points.len() * DESCRIPTOR_LEN),
-        colors: Vec::with_capacity(points.len()),
-    };
-    for (point, descriptor) in points.iter().zip(&descriptors) {
-        let (x, y) = in_image(point.x, point.y);
-        let at = (y as usize * width as usize + x as usize) * 3;
-        features.colors.push([image.rgb[at], image.rgb[at + 1], image.rgb[at + 2]]);
-        features.keypoints.push(Keypoint {
-            x,
-            y,
-            size: point.size * scale_x,
-            orientation: point.orientation,
-            noise_px: keypoint_noise_px(point.size) * scale_x,
-        });
-        push_root_sift(descriptor, &mut features.descriptors);
+    let source = Source { params, image, camera, mask, offset_x: padding as f32 * scale[0], scale };
+    let mut features = ImageFeatures { width, height, ..ImageFeatures::default() };
+    features.light = source.append_view(&grey, [1.0, 1.0], params.max_features, &mut features);
+    if params.simulated_tilt > 1.0 {
+        for tilt in [[params.simulated_tilt, 1.0], [1.0, params.simulated_tilt]] {
+            let squeezed = grey.resized(tilt.map(f64::recip))?;
+            let factor =
+                [grey.width as f32 / squeezed.width as f32, grey.height as f32 / squeezed.height as f32];
+            let start = features.len() as u32;
+            let light = source.append_view(&squeezed, factor, params.max_features / 2, &mut features);
+            features.simulated.push(SimulatedView { start, light });
+        }
     }
     Ok(features)
+}
+
+/// What all views of an image are made from.
+struct Source<'a> {
+    params: &'a FeatureParams,
+    image: &'a DecodedImage,
+    camera: &'a Camera,
+    mask: Option<&'a Mask>,
+    /// Image pixels left of the image's first column.
+    offset_x: f32,
+    /// Image pixels per grey pixel.
+    scale: [f32; 2],
+}
+
+impl Source<'_> {
+    /// Detects in one view, `factor` grey pixels per pixel of the view, and appends at most `budget` keypoints. Returns
+    /// how many of them are light.
+    fn append_view(&self, view: &Grey, factor: [f32; 2], budget: usize, features: &mut ImageFeatures) -> u32 {
+        let Self { params, image, camera, .. } = self;
+        let (width, height) = (image.width, image.height);
+        let sift = SiftParams {
+            contrast_threshold: params.contrast_threshold,
+            edge_threshold: params.edge_threshold,
+            octave_layers: params.octave_layers as usize,
+            sigma_px: params.sigma_px,
+        };
+        let scale = [self.scale[0] * factor[0], self.scale[1] * factor[1]];
+        let in_image = |x: f32, y: f32| (x * scale[0] - self.offset_x, y * scale[1]);
+        let nadir = (params.nadir_cone_deg > 0.0 && camera.is_panoramic())
+            .then(|| params.nadir_cone_deg.to_radians().cos());
+        let allows = |x: f32, y: f32| {
+            let (x, y) = in_image(x, y);
+            let inside = (0.0..width as f32).contains(&x) && (0.0..height as f32).contains(&y);
+            let ray = || camera.unproject(&nalgebra::Vector2::new(x.into(), y.into()));
+            inside
+                && self.mask.is_none_or(|mask| mask.allows(x, y, width, height))
+                && nadir.is_none_or(|limit| ray().is_none_or(|ray| ray.y < limit))
+        };
+        let choose = |points: &[SiftPoint]| {
+            let candidate = |(index, point): (usize, &SiftPoint)| {
+                let (x, y) = in_image(point.x, point.y);
+                Candidate { index, x, y, response: point.response, is_light: point.is_light }
+            };
+            let mut candidates: Vec<Candidate> = points.iter().enumerate().map(candidate).collect();
+            // A total order, so that the choice does not depend on the detector's.
+            candidates.sort_by(|a, b| {
+                b.response
+                    .total_cmp(&a.response)
+                    .then(a.y.total_cmp(&b.y))
+                    .then(a.x.total_cmp(&b.x))
+                    .then(a.index.cmp(&b.index))
+            });
+            let mut chosen = choose(budget, params.even_share, camera, &candidates);
+            chosen.sort_by_key(|candidate| !candidate.is_light);
+            chosen.iter().map(|candidate| candidate.index).collect()
+        };
+        let (points, descriptors) = detect_and_describe(&sift, view.view(), allows, choose);
+        // One figure for both axes of a squeezed view: their geometric mean.
+        let size_scale = if factor == [1.0, 1.0] { scale[0] } else { (scale[0] * scale[1]).sqrt() };
+        for (point, descriptor) in points.iter().zip(&descriptors) {
+            let (x, y) = in_image(point.x, point.y);
+            let at = (y as usize * width as usize + x as usize) * 3;
+            features.colors.push([image.rgb[at], image.rgb[at + 1], image.rgb[at + 2]]);
+            features.keypoints.push(Keypoint {
+                x,
+                y,
+                size: point.size * size_scale,
+                orientation: point.orientation,
+                noise_px: keypoint_noise_px(point.size) * size_scale,
+            });
+            push_root_sift(descriptor, &mut features.descriptors);
+        }
+        points.iter().filter(|point| point.is_light).count() as u32
+    }
 }
 
 /// Expected standard deviation in pixels of the position of a keypoint with this diameter.
@@ -228,8 +267,13 @@ impl Grey {
             return Ok(self);
         }
         let share = f64::from(max_side) / longer as f64;
-        let side = |side: usize| ((side as f64 * share).round() as usize).max(1);
-        let (width, height) = (side(self.width), side(self.height));
+        self.resized([share, share])
+    }
+
+    /// Reduced by averaging, by these shares of its width and height.
+    fn resized(&self, share: [f64; 2]) -> Result<Self, FeatureError> {
+        let side = |side: usize, share: f64| ((side as f64 * share).round() as usize).max(1);
+        let (width, height) = (side(self.width, share[0]), side(self.height, share[1]));
         let mut values = vec![0; width * height];
         let mut run = || {
             let source = Mat::new_rows_cols_with_data(self.height as i32, self.width as i32, &self.values)?;
@@ -265,8 +309,12 @@ fn detector_error(error: &opencv::Error) -> FeatureError {
 }
 
 /// The strongest of each cell up to an even share, then the strongest of the rest; strongest first.
-fn choose<'a>(params: &FeatureParams, camera: &Camera, candidates: &'a [Candidate]) -> Vec<&'a Candidate> {
-    let budget = params.max_features;
+fn choose<'a>(
+    budget: usize,
+    even_share: f64,
+    camera: &Camera,
+    candidates: &'a [Candidate],
+) -> Vec<&'a Candidate> {
     if candidates.len() <= budget {
         return candidates.iter().collect();
     }
@@ -276,7 +324,7 @@ fn choose<'a>(params: &FeatureParams, camera: &Camera, candidates: &'a [Candidat
     for &cell in &cells {
         counts[cell] += 1;
     }
-    let quota = cell_quota(&counts, (budget as f64 * params.even_share) as usize);
+    let quota = cell_quota(&counts, (budget as f64 * even_share) as usize);
     let mut taken = vec![0usize; counts.len()];
     let mut kept = vec![false; candidates.len()];
     for (index, &cell) in cells.iter().enumerate() {
@@ -356,6 +404,7 @@ mod tests {
     use nalgebra::Vector2;
 
     use super::*;
+    use crate::{DESCRIPTOR_LEN, MatchParams, match_features};
 
     const BLOB: f64 = 4.0;
 
@@ -415,6 +464,49 @@ mod tests {
         for center in centers {
             assert!(nearest(&features, center) < 0.05, "{center:?}: {}", nearest(&features, center));
         }
+    }
+
+    #[test]
+    fn keypoints_of_simulated_views_lie_where_the_blobs_are() {
+        let centers = [[60.5, 70.5], [130.3, 60.8], [90.75, 140.25], [170.0, 150.0]];
+        let params = FeatureParams { simulated_tilt: 1.5, ..FeatureParams::default() };
+        let features = extract(&params, &blobs(240, 200, &centers), &photo(240, 200), None).unwrap();
+        assert_eq!(features.simulated.len(), 2);
+        for view in features.simulated_parts() {
+            let of_view: Vec<Keypoint> = features.keypoints[view[0].start..view[1].end].to_vec();
+            let of_view = ImageFeatures { keypoints: of_view, ..ImageFeatures::default() };
+            for center in centers {
+                assert!(nearest(&of_view, center) < 0.2, "{center:?}: {}", nearest(&of_view, center));
+            }
+        }
+    }
+
+    #[test]
+    fn a_simulated_view_matches_a_wall_seen_along_the_street() {
+        // Seen at a slant, a wall is narrower by about the tilt.
+        const TILT: u32 = 3;
+        let straight = texture(900, 300);
+        let slanted = (0..300)
+            .flat_map(|y| (0..300).map(move |x| (x, y)))
+            .flat_map(|(x, y)| {
+                let of = |dx: u32| u32::from(straight.rgb[((y * 900 + x * TILT + dx) * 3) as usize]);
+                [((0..TILT).map(of).sum::<u32>() / TILT) as u8; 3]
+            })
+            .collect();
+        let slanted = DecodedImage::from_rgb(300, 300, slanted).unwrap();
+        let right = |simulated_tilt: f64| {
+            let params = FeatureParams { simulated_tilt, ..FeatureParams::default() };
+            let first = extract(&params, &straight, &photo(900, 300), None).unwrap();
+            let second = extract(&params, &slanted, &photo(300, 300), None).unwrap();
+            let matches = match_features(&MatchParams::default(), &first, &second);
+            let near = matches.iter().filter(|m| {
+                let (a, b) = (first.keypoints[m.first as usize], second.keypoints[m.second as usize]);
+                (a.x / TILT as f32 - b.x).abs() < 2.0 && (a.y - b.y).abs() < 2.0
+            });
+            near.count()
+        };
+        let (without, with) = (right(1.0), right(2.5));
+        assert!(with > 20 && with > 3 * without, "{with} with, {without} without");
     }
 
     #[test]

@@ -34,6 +34,15 @@ impl Keypoint {
     }
 }
 
+/// Where the keypoints of a simulated view are in [`ImageFeatures::keypoints`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SimulatedView {
+    /// Its first keypoint.
+    pub start: u32,
+    /// How many of its keypoints are brighter than their surround; they come first.
+    pub light: u32,
+}
+
 /// Keypoints, descriptors and colours of one image, index by index.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ImageFeatures {
@@ -42,10 +51,13 @@ pub struct ImageFeatures {
     /// Image height in pixels, after EXIF orientation.
     pub height: u32,
     /// The detected points: first those brighter than their surround, then those darker; in each part the strongest
-    /// first.
+    /// first. Those of simulated views follow, each view in the same order.
     pub keypoints: Vec<Keypoint>,
-    /// How many keypoints are brighter than their surround.
+    /// How many of the image's own keypoints are brighter than their surround.
     pub light: u32,
+    /// Where the keypoints of simulated views are (see [`crate::FeatureParams::simulated_tilt`]); they come after the
+    /// image's own.
+    pub simulated: Vec<SimulatedView>,
     /// Row-major descriptors, `keypoints.len() × DESCRIPTOR_LEN`.
     pub descriptors: Vec<u8>,
     /// sRGB colour of the image at each keypoint.
@@ -68,10 +80,27 @@ impl ImageFeatures {
         &self.descriptors[index * DESCRIPTOR_LEN..(index + 1) * DESCRIPTOR_LEN]
     }
 
-    /// The indices of the keypoints brighter than their surround, and of those darker.
+    /// Number of keypoints found in the image itself.
+    pub fn own_len(&self) -> usize {
+        self.simulated.first().map_or(self.len(), |view| (view.start as usize).min(self.len()))
+    }
+
+    /// The indices of the image's own keypoints that are brighter than their surround, and of those darker.
     pub fn parts(&self) -> [Range<usize>; 2] {
-        let light = (self.light as usize).min(self.len());
-        [0..light, light..self.len()]
+        let own = self.own_len();
+        let light = (self.light as usize).min(own);
+        [0..light, light..own]
+    }
+
+    /// The same of each simulated view.
+    pub fn simulated_parts(&self) -> impl Iterator<Item = [Range<usize>; 2]> + '_ {
+        self.simulated.iter().enumerate().map(|(at, view)| {
+            let next = self.simulated.get(at + 1).map_or(self.len(), |next| next.start as usize);
+            let end = next.min(self.len());
+            let start = (view.start as usize).min(end);
+            let light = start.saturating_add(view.light as usize).min(end);
+            [start..light, light..end]
+        })
     }
 
     /// The descriptors of some keypoints.

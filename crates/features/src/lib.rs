@@ -56,7 +56,7 @@ pub use decode::{
 };
 pub use error::FeatureError;
 pub use extract::{FeatureParams, extract, keypoint_noise_px};
-pub use features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Keypoint, Rays};
+pub use features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Keypoint, Rays, SimulatedView};
 pub use mask::Mask;
 pub use matching::{
     DescriptorBlock, GuidedParams, Match, MatchParams, TwoNearest, match_features, match_guided, two_nearest,

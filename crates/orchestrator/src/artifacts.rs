@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 use setloc_camset::{PhotoLocalization, SetLocalization};
-use setloc_features::{ImageFeatures, Keypoint, Match};
+use setloc_features::{ImageFeatures, Keypoint, Match, SimulatedView};
 use setloc_index::SceneIndex;
 use setloc_sfm::{MapperOutput, TwoView};
 
@@ -12,15 +12,20 @@ use crate::serde_artifact;
 /// Features as raw blocks behind a short head: a gigabyte of descriptors is copied, not parsed.
 impl Artifact for ImageFeatures {
     const KIND: &'static str = "features";
-    const SCHEMA: u32 = 2;
+    const SCHEMA: u32 = 3;
 
     fn to_payload(&self) -> Result<Vec<u8>, CodecError> {
         let count = self.len();
-        let mut payload = Vec::with_capacity(24 + count * (size_of::<Keypoint>() + 131));
+        let mut payload = Vec::with_capacity(64 + count * (size_of::<Keypoint>() + 131));
         payload.extend_from_slice(&self.width.to_le_bytes());
         payload.extend_from_slice(&self.height.to_le_bytes());
         payload.extend_from_slice(&(count as u64).to_le_bytes());
-        payload.extend_from_slice(&u64::from(self.light).to_le_bytes());
+        payload.extend_from_slice(&self.light.to_le_bytes());
+        payload.extend_from_slice(&(self.simulated.len() as u32).to_le_bytes());
+        for view in &self.simulated {
+            payload.extend_from_slice(&view.start.to_le_bytes());
+            payload.extend_from_slice(&view.light.to_le_bytes());
+        }
         for keypoint in &self.keypoints {
             for value in [keypoint.x, keypoint.y, keypoint.size, keypoint.orientation, keypoint.noise_px] {
                 payload.extend_from_slice(&value.to_le_bytes());
@@ -36,7 +41,13 @@ impl Artifact for ImageFeatures {
         let (head, rest) = payload.split_at_checked(24).ok_or_else(wrong)?;
         let number = |bytes: &[u8]| bytes.iter().rev().fold(0_u64, |sum, &byte| (sum << 8) | u64::from(byte));
         let (width, height) = (number(&head[..4]) as u32, number(&head[4..8]) as u32);
-        let (count, light) = (number(&head[8..16]) as usize, number(&head[16..]) as u32);
+        let (count, light) = (number(&head[8..16]) as usize, number(&head[16..20]) as u32);
+        let views = number(&head[20..]) as usize;
+        let (views, rest) = views.checked_mul(8).and_then(|n| rest.split_at_checked(n)).ok_or_else(wrong)?;
+        let simulated: Vec<SimulatedView> = views
+            .chunks_exact(8)
+            .map(|view| SimulatedView { start: number(&view[..4]) as u32, light: number(&view[4..]) as u32 })
+            .collect();
         if light as usize > count {
             return Err(wrong());
         }
@@ -55,6 +66,7 @@ impl Artifact for ImageFeatures {
             width,
             height,
             light,
+            simulated,
             keypoints: keypoints.chunks_exact(20).map(keypoint).collect(),
             descriptors: descriptors.to_vec(),
             colors: colors.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),

@@ -17,6 +17,8 @@ use crate::stages::{FeatureParams, MatchParams};
 pub struct Config {
     /// Detection and description.
     pub features: FeatureParams,
+    /// Where the features of query photos differ from the scene's.
+    pub photos: PhotoParams,
     /// Which pairs are matched.
     pub pairs: PairParams,
     /// Two-nearest-neighbour matching.
@@ -35,6 +37,23 @@ pub struct Config {
     pub single: SingleParams,
     /// Localization of a set.
     pub camset: CamsetParams,
+}
+
+/// Where the features of query photos differ from the scene's.
+///
+/// A scene is built from panoramas that lie close together; photos of a set often see one wall from far apart, so
+/// oblique views of them are simulated.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PhotoParams {
+    /// In place of `features.simulated_tilt`.
+    pub simulated_tilt: f64,
+}
+
+impl Default for PhotoParams {
+    fn default() -> Self {
+        Self { simulated_tilt: 2.0 }
+    }
 }
 
 /// Which pairs of images are matched.
@@ -56,6 +75,11 @@ impl Default for PairParams {
 }
 
 impl Config {
+    /// How features of query photos are extracted.
+    pub fn photo_features(&self) -> FeatureParams {
+        FeatureParams { simulated_tilt: self.photos.simulated_tilt, ..self.features.clone() }
+    }
+
     /// Defaults, then the file, then `key=value` settings such as `two_view.min_inliers=30`.
     ///
     /// # Errors

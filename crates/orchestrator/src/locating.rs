@@ -104,7 +104,7 @@ fn run(
     let set = as_set.then(|| add_set(&mut graph, target, &folder.images, what)).transpose()?;
     let features = match &set {
         Some(set) => set.model.features.clone(),
-        None => add_features_of(&mut graph, &folder.images, &what.config),
+        None => add_features_of(&mut graph, &folder.images, &what.config.photo_features()),
     };
     let mut single = Vec::new();
     if alone {

@@ -19,8 +19,8 @@ mod visibility;
 pub use geometry::{Rigid, Similarity};
 pub use georegister::{GeoregisterParams, Georegistration, georegister};
 pub use mapper::{
-    InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, RegistrationRecord,
-    reconstruct,
+    InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, Mosaic, PutativePair,
+    RegistrationRecord, reconstruct,
 };
 pub use quality::{PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess};
 pub use reconstruction::{

@@ -6,29 +6,36 @@ mod direction;
 mod initial;
 mod model;
 mod register;
+mod standpoint;
 mod structure;
+
+use std::collections::BTreeMap;
 
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
-use setloc_features::{Camera, ImageFeatures};
+use setloc_features::{Camera, ImageFeatures, Match};
+
+pub use self::standpoint::Mosaic;
 
 use self::{
     adjust::{Scope, adjust, is_adjustable},
     correspondence::CorrespondenceGraph,
     model::Model,
     register::{
-        PoseHypothesis, Visibility, hypothesize, hypothesize_from_pairs, register, scene_matches, visibility,
+        PoseHypothesis, Visibility, hypothesize, hypothesize_baseline, hypothesize_from_pairs, register,
+        scene_matches, visibility,
     },
+    standpoint::Standpoints,
     structure::{PointLimits, complete_and_merge, filter, triangulate_image},
 };
 use crate::{
-    CameraId, Georegistration, ImageId, PairGeometry, Reconstruction, Rigid, TwoViewKind,
+    CameraId, Georegistration, ImageId, PairGeometry, Reconstruction, Rigid, TwoViewKind, TwoViewParams,
     bundle::{BundleParams, RobustLoss},
     robust::RansacParams,
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 1;
+pub const MAPPER_VERSION: u32 = 2;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -46,6 +53,11 @@ pub struct MapperParams {
     pub max_initial_pairs: usize,
     /// Fewest inliers of a registration.
     pub min_registration_inliers: usize,
+    /// Fewest inliers of a registration whose rotation and direction of movement a verified pair gives: the points then
+    /// only have to agree on the length of the baseline.
+    pub min_confirmed_inliers: usize,
+    /// Smallest share of an image's 2D-to-3D matches that must agree with such a pose.
+    pub min_confirmed_share: f64,
     /// Smallest share of the points in plain view that a registration must match; guards against repeated structure.
     pub min_visibility_recall: f64,
     /// Share of the directions with points in plain view in which any was matched that does as well: where all matching
@@ -55,6 +67,9 @@ pub struct MapperParams {
     pub min_visible_points: usize,
     /// Fewest matches of a pure rotation that registers an image at the standpoint of another.
     pub min_turn_matches: usize,
+    /// Smallest share of the keypoints that two photos ought to share after a turn that must match for them to count as
+    /// taken from one standpoint.
+    pub min_turn_recall: f64,
     /// Rotation from a verified pair's that still counts as agreement with it, in degrees.
     pub max_pair_rotation_deg: f64,
     /// Smallest share of the verified matches to registered images whose pairs must agree with a pose's rotation.
@@ -78,10 +93,13 @@ impl Default for MapperParams {
             min_initial_parallax_deg: 3.0,
             max_initial_pairs: 30,
             min_registration_inliers: 15,
+            min_confirmed_inliers: 8,
+            min_confirmed_share: 0.5,
             min_visibility_recall: 0.1,
             min_visibility_coverage: 0.4,
             min_visible_points: 100,
-            min_turn_matches: 40,
+            min_turn_matches: 20,
+            min_turn_recall: 0.2,
             max_pair_rotation_deg: 8.0,
             min_pair_agreement: 0.2,
             max_pose_hypotheses: 3,
@@ -124,6 +142,8 @@ pub struct InputImage<'a> {
     pub features: &'a ImageFeatures,
     /// Measured centre in local east-north-up metres, when GPS is given.
     pub position_prior: Option<Vector3<f64>>,
+    /// What it covers, when it is a mosaic of photos from one standpoint; `None` for plain images.
+    pub mosaic: Option<&'a Mosaic>,
 }
 
 /// What the mapper works on.
@@ -137,6 +157,21 @@ pub struct MapperInput<'a> {
     pub images: Vec<InputImage<'a>>,
     /// Verified pairs.
     pub pairs: &'a [PairGeometry],
+    /// All matches of the pairs, also those that no geometry explains; pairs left out count with their inliers.
+    pub putative: &'a [PutativePair],
+    /// How pairs of mosaics are verified.
+    pub two_view: TwoViewParams,
+}
+
+/// All matches of two images, before verification.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PutativePair {
+    /// First image.
+    pub first: ImageId,
+    /// Second image.
+    pub second: ImageId,
+    /// Its matches.
+    pub matches: Vec<Match>,
 }
 
 /// How one image entered the model, or why it did not.
@@ -185,6 +220,13 @@ pub struct MapperOutput {
 /// Images that share no geometry with others are in no component. The frame of a component is its first camera's,
 /// with the first baseline as unit of length, until it is georegistered.
 pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
+    match Standpoints::find(params, input, seed) {
+        Some(standpoints) => standpoints.expand(reconstruct_images(params, &standpoints.input(), seed)),
+        None => reconstruct_images(params, input, seed),
+    }
+}
+
+fn reconstruct_images(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
     let mut output = MapperOutput::default();
     let mut taken = vec![false; input.images.len()];
     while let Some(mut mapper) = Mapper::new(params, input, taken.clone(), seed) {
@@ -217,6 +259,8 @@ struct Mapper<'a> {
     anchors: Vec<Option<(ImageId, UnitQuaternion<f64>)>>,
     /// 2D-to-3D matches that an image had when it was last refused.
     refused_at: Vec<usize>,
+    /// Points that a registered image had when the baseline of a pair (by index) was last sought.
+    baseline_tried: BTreeMap<usize, usize>,
     records: Vec<RegistrationRecord>,
     images_at_last_global: usize,
     seed: u64,
@@ -246,6 +290,7 @@ impl<'a> Mapper<'a> {
             taken,
             anchors: vec![None; input.images.len()],
             refused_at: vec![0; input.images.len()],
+            baseline_tried: BTreeMap::new(),
             records: Vec::new(),
             images_at_last_global: 2,
             seed,
@@ -278,7 +323,7 @@ impl<'a> Mapper<'a> {
                     register(&mut self.model, image, &hypothesis);
                     image
                 }
-                None => match self.register_by_turn() {
+                None => match self.register_by_turn().or_else(|| self.register_by_baseline()) {
                     Some(image) => image,
                     None => break,
                 },
@@ -330,6 +375,45 @@ impl<'a> Mapper<'a> {
         Some(image)
     }
 
+    /// Registers an image by one verified pair whose baseline gets its length from points that were hard to match.
+    ///
+    /// Where each image shares one part of a wall with the image before and another part with the image after, no match
+    /// sees three of them, and the length of each baseline is unknown. The pair's epipolar circles then find what the
+    /// ratio test over the whole image refused. Many such matches are wrong, but only the right length is one that many
+    /// agree on.
+    fn register_by_baseline(&mut self) -> Option<ImageId> {
+        let mut best: Option<(usize, ImageId, PoseHypothesis)> = None;
+        for (index, pair) in self.model.input.pairs.iter().enumerate() {
+            let (first, second) = (pair.first, pair.second);
+            let (image, other) = match (self.model.is_registered(first), self.model.is_registered(second)) {
+                (true, false) => (second, first),
+                (false, true) => (first, second),
+                _ => continue,
+            };
+            if self.taken[image.index()]
+                || pair.two_view.kind == TwoViewKind::PureRotation
+                || pair.two_view.inliers.len() < self.params.min_initial_points
+            {
+                continue;
+            }
+            // Nothing new can be found until the other image has other points.
+            let points = self.model.observed_points(other);
+            if self.baseline_tried.get(&index) == Some(&points) {
+                continue;
+            }
+            self.baseline_tried.insert(index, points);
+            if let Some(pose) = hypothesize_baseline(&self.model, pair, image, other, &self.params.ransac())
+                && best.as_ref().is_none_or(|(most, ..)| pose.inliers.len() > *most)
+            {
+                best = Some((pose.inliers.len(), image, pose));
+            }
+        }
+        let (_, image, pose) = best?;
+        let pose = self.first_accepted(image, vec![pose])?;
+        register(&mut self.model, image, &pose);
+        Some(image)
+    }
+
     fn place_by_turn(&mut self, image: ImageId) {
         if let Some((anchor, image_from_anchor)) = self.anchors[image.index()]
             && let Some(pose) = &self.model.poses[anchor.index()]
@@ -356,7 +440,7 @@ impl<'a> Mapper<'a> {
             .filter(|&image| !self.model.is_registered(image) && !self.taken[image.index()])
             .map(|image| (scene_matches(&self.model, &self.graph, image).len(), image))
             .filter(|&(count, image)| {
-                count >= self.params.min_registration_inliers
+                count >= self.params.min_confirmed_inliers.min(self.params.min_registration_inliers)
                     && count > self.refused_at[image.index()] * 11 / 10
             })
             .collect();
@@ -384,7 +468,12 @@ impl<'a> Mapper<'a> {
         let resected =
             hypothesize(&self.model, &self.graph, image, &ransac, self.params.max_pose_hypotheses, seed);
         self.first_accepted(image, resected).or_else(|| {
-            let mut from_pairs = hypothesize_from_pairs(&self.model, &self.graph, image, &ransac);
+            let confirmed = RansacParams { min_inliers: self.params.min_confirmed_inliers, ..ransac };
+            let mut from_pairs = hypothesize_from_pairs(&self.model, &self.graph, image, &confirmed);
+            from_pairs.retain(|pose| {
+                pose.inliers.len() as f64 >= self.params.min_confirmed_share * pose.candidates as f64
+                    || pose.inliers.len() >= self.params.min_registration_inliers
+            });
             from_pairs.truncate(self.params.max_pose_hypotheses);
             self.first_accepted(image, from_pairs)
         })
@@ -399,7 +488,6 @@ impl<'a> Mapper<'a> {
             let plausible = if judged { self.is_recognized(&seen) } else { !refused_before };
             refused_before |= !plausible;
             let accepted = plausible
-                && hypothesis.inliers.len() >= self.params.min_registration_inliers
                 && self.pair_agreement(image, &hypothesis.world_from_camera)
                     >= self.params.min_pair_agreement;
             self.records.push(RegistrationRecord {

@@ -10,7 +10,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another geometry.
-pub const TWO_VIEW_VERSION: u32 = 1;
+pub const TWO_VIEW_VERSION: u32 = 2;
 
 /// How to verify a pair.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -24,6 +24,9 @@ pub struct TwoViewParams {
     pub min_parallax_deg: f64,
     /// Share of the inliers that a rotation alone must explain for the pair to count as one.
     pub rotation_share: f64,
+    /// Where a rotation explains most of the inliers: the share of the matches it leaves over that a baseline must
+    /// explain for the pair not to count as a rotation. Chance alone reaches a tenth.
+    pub min_baseline_share: f64,
     /// Most samples drawn for one geometry; below a third of inliers a pair is worth little to the mapper.
     pub max_iterations: u32,
     /// Most geometries of one pair.
@@ -39,6 +42,7 @@ impl Default for TwoViewParams {
             max_error_sigma: 6.0,
             min_parallax_deg: 0.5,
             rotation_share: 0.8,
+            min_baseline_share: 0.2,
             max_iterations: 2500,
             max_geometries: 2,
             min_runner_up_share: 0.2,
@@ -66,6 +70,17 @@ pub struct TwoView {
     pub inliers: Vec<Match>,
     /// Median parallax angle of the inliers in radians.
     pub median_parallax_rad: f64,
+}
+
+impl TwoView {
+    /// The same geometry with the two images exchanged.
+    #[must_use]
+    pub fn flipped(&self) -> Self {
+        let mut inliers: Vec<Match> =
+            self.inliers.iter().map(|m| Match { first: m.second, second: m.first }).collect();
+        inliers.sort_unstable();
+        Self { second_from_first: self.second_from_first.inverse(), inliers, ..self.clone() }
+    }
 }
 
 /// A verified pair of images.
@@ -152,16 +167,22 @@ fn verify_once(
     let median_parallax_rad = *parallaxes.select_nth_unstable_by(middle, f64::total_cmp).1;
     let turn =
         estimate_rotation(&ransac, &first_bearings, &second_bearings, &first_sigmas, &second_sigmas, seed);
-    let explains =
-        turn.as_ref().map_or(0.0, |turn| turn.inliers.len() as f64 / estimate.inliers.len() as f64);
-    let rotation_only =
-        median_parallax_rad < params.min_parallax_deg.to_radians() || explains >= params.rotation_share;
+    let is_turn = turn.as_ref().is_some_and(|turn| {
+        let (turned, explained) = (turn.inliers.len() as f64, estimate.inliers.len() as f64);
+        // What a baseline explains beyond the turn, and what is left for it to explain.
+        let (gained, left) = (explained - turned, matches.len() as f64 - turned);
+        turned >= params.rotation_share * explained
+            || (turned >= 0.7 * explained && gained < params.min_baseline_share * left)
+    });
     let mut second_from_first = estimate.second_from_first;
-    if let Some(turn) = turn.filter(|_| rotation_only && explains >= params.rotation_share) {
-        // Without a baseline the essential matrix has directions to spare that its rotation soaks up.
+    let mut inliers = estimate.inliers;
+    if let Some(turn) = turn.filter(|_| is_turn) {
+        // Without a baseline the essential matrix has directions to spare, which its rotation and chance matches soak up.
         second_from_first.rotation = turn.second_from_first;
+        inliers = turn.inliers;
     }
-    let mut inliers: Vec<Match> = estimate.inliers.iter().map(|&index| matches[index as usize]).collect();
+    let rotation_only = is_turn || median_parallax_rad < params.min_parallax_deg.to_radians();
+    let mut inliers: Vec<Match> = inliers.iter().map(|&index| matches[index as usize]).collect();
     inliers.sort_unstable();
     Some(TwoView {
         kind: if rotation_only { TwoViewKind::PureRotation } else { TwoViewKind::General },

@@ -144,6 +144,7 @@ impl Street {
             camera: CameraId(if shared { 0 } else { index as u32 }),
             features: &self.features[index],
             position_prior: None,
+            mosaic: None,
         });
         let cameras = if shared { vec![cameras[0].clone()] } else { cameras.to_vec() };
         let input = MapperInput {
@@ -151,6 +152,8 @@ impl Street {
             cameras,
             images: images.collect(),
             pairs: &pairs,
+            putative: &[],
+            two_view: TwoViewParams::default(),
         };
         reconstruct(&MapperParams::default(), &input, 5)
     }
@@ -220,6 +223,31 @@ fn the_unknown_focal_length_and_distortion_of_photos_are_found() {
     assert!((found[0] / truth.params[0] - 1.0).abs() < 0.01, "{found:?}");
     assert!((found[3] - truth.params[3]).abs() < 0.01, "{found:?}");
     assert!(worst_m < 0.05, "{worst_m} m");
+}
+
+#[test]
+fn photos_turned_on_the_spot_are_mapped_as_one_standpoint() {
+    // Looking at one side of the street only, every other photo turned back by 20°: those share most of what they
+    // see, without parallax.
+    let camera = Camera::from_focal_guess(1600, 1200, 1250.0);
+    let views = (0..12).map(|k| {
+        let turn = if k % 2 == 0 { 0.0 } else { -20.0_f64.to_radians() };
+        let center =
+            Vector3::new(-2.0 + f64::from(k / 2 % 2), 0.1 * f64::from(k / 4), f64::from(k / 2) * 4.0);
+        // Towards +x, y down: the camera's z is the world's x.
+        let yaw = std::f64::consts::FRAC_PI_2 + turn;
+        (camera.clone(), Rigid::new(UnitQuaternion::from_axis_angle(&Vector3::y_axis(), yaw), center))
+    });
+    let street = Street::new(views.collect(), 0.3, 0, 11);
+    let output = street.map(&street.cameras, true);
+    let (registered, center, rotation) = street.errors(&output);
+    assert_eq!(registered, 12, "{:?}", output.report.registrations);
+    assert!(center < 0.05 && rotation < 0.2, "{center} m, {rotation}°");
+    let poses: Vec<Rigid> =
+        output.components[0].images.iter().filter_map(|image| image.world_from_camera).collect();
+    for pair in poses.chunks(2) {
+        assert_eq!(pair[0].translation, pair[1].translation, "one standpoint has one centre");
+    }
 }
 
 #[test]

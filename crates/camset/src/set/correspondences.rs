@@ -7,9 +7,9 @@ use setloc_index::{LocalDescriptors, NearestPoints, SceneIndex};
 use setloc_sfm::{PointId, Reconstruction, Rigid, Similarity};
 
 use super::PhotoEvidence;
-use crate::CamsetParams;
 use crate::evidence::PhotoRays;
 use crate::observability::SetRay;
+use crate::{CamsetParams, Verdict};
 
 /// A scene point and the features of the set that are believed to see it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -65,9 +65,21 @@ pub(crate) fn correspondences(
             seen_by: tracks[local].clone(),
         });
     }
+    // What a photo that is localized alone sees has been confirmed by its pose, the ratio test or not.
+    for (slot, &photo) in members.iter().enumerate() {
+        let PhotoEvidence { alone, seen, .. } = &evidence[photo];
+        for seen in seen.iter().filter(|_| alone.verdict == Verdict::Localized) {
+            if used.insert(seen.point) {
+                let seen_by = vec![(slot, seen.feature)];
+                found.push(SetCorrespondence { scene: seen.point, local: None, seen_by });
+            }
+        }
+    }
     if params.lone_rays {
         for (slot, &photo) in members.iter().enumerate() {
-            for lone in index.correspondences(&evidence[photo].nearest, params.ratio) {
+            for lone in
+                index.correspondences(&evidence[photo].nearest[..rays[slot].features.own_len()], params.ratio)
+            {
                 if !in_tracks[slot].contains(&lone.feature) && !used.contains(&lone.point) {
                     let seen_by = vec![(slot, lone.feature)];
                     found.push(SetCorrespondence { scene: lone.point, local: None, seen_by });

@@ -1,5 +1,6 @@
 //! The pose of the rigid camera set, and whether another pose would do as well.
 
+use nalgebra::Vector3;
 use setloc_sfm::robust::{
     GeneralizedPoseOptions, GeneralizedRay, GeneralizedSolver, RansacParams, estimate_absolute_pose,
     estimate_generalized_pose,
@@ -53,6 +54,7 @@ pub(crate) fn rigid_pose(
         let sampled = view.absolute_pose(params, seed.wrapping_add(slot as u64));
         for axes_at_photo in alone.into_iter().chain(sampled) {
             candidates.extend(view.with_local_depths(params, &axes_at_photo, correspondences, model));
+            candidates.extend(rays.with_baselines(params, &axes_at_photo, &in_set.translation));
         }
     }
     let score = |pose: &Similarity| rays.score(pose, params.max_error_sigmas, count);
@@ -105,6 +107,8 @@ fn estimate(params: &CamsetParams, rays: &SetRays, seed: u64) -> Option<Similari
 const PHOTO_SAMPLES: u32 = 3000;
 /// Fewest agreeing rays that make a single photo's pose worth a hypothesis; all rays of the set judge it afterwards.
 const PHOTO_INLIERS: usize = 5;
+/// Scales within this factor of each other agree.
+const SAME_SCALE: f64 = 1.03;
 /// Quantiles of the depth ratios that are tried as scale.
 const SCALE_QUANTILES: [f64; 3] = [0.5, 0.25, 0.75];
 
@@ -168,15 +172,52 @@ impl SetRays {
             .iter()
             .map(|quantile| {
                 let scale = ratios[(quantile * (ratios.len() - 1) as f64).round() as usize];
-                let rotation = axes_at_photo.rotation;
-                Similarity {
-                    scale,
-                    rotation,
-                    translation: axes_at_photo.translation - rotation * origin * scale,
-                }
+                scaled_about(axes_at_photo, &origin, scale)
             })
             .collect()
     }
+
+    /// The same from the other photos' rays: each asks for the scale at which it meets its scene point.
+    ///
+    /// Where the photo that sees the scene shares no local point with it, a few rays of the next photos still agree on
+    /// how far these are away, and wrong matches do not agree on anything.
+    fn with_baselines(
+        &self,
+        params: &CamsetParams,
+        axes_at_photo: &Rigid,
+        origin: &Vector3<f64>,
+    ) -> Vec<Similarity> {
+        let mut scales: Vec<f64> = self
+            .rays
+            .iter()
+            .filter_map(|ray| {
+                let step = axes_at_photo.rotation * (ray.origin - origin);
+                let direction = axes_at_photo.rotation * ray.direction;
+                let (wanted, lever) =
+                    ((ray.point - axes_at_photo.translation).cross(&direction), step.cross(&direction));
+                let scale = wanted.dot(&lever) / lever.norm_squared();
+                let pose = scaled_about(axes_at_photo, origin, scale);
+                let meets = scale > 0.0
+                    && scale.is_finite()
+                    && ray.error_sigmas(&pose.inverse()) < params.max_error_sigmas;
+                meets.then_some(scale)
+            })
+            .collect();
+        scales.sort_by(f64::total_cmp);
+        // The scale that most others are near to.
+        let near = |at: usize| {
+            let (low, high) = (scales[at] / SAME_SCALE, scales[at] * SAME_SCALE);
+            scales.partition_point(|&scale| scale <= high) - scales.partition_point(|&scale| scale < low)
+        };
+        let best = (0..scales.len()).max_by_key(|&at| near(at)).filter(|&at| near(at) >= 3);
+        best.map(|at| scaled_about(axes_at_photo, origin, scales[at])).into_iter().collect()
+    }
+}
+
+/// The set's pose that puts the photo at `origin` where it is, at this scale.
+fn scaled_about(axes_at_photo: &Rigid, origin: &Vector3<f64>, scale: f64) -> Similarity {
+    let rotation = axes_at_photo.rotation;
+    Similarity { scale, rotation, translation: axes_at_photo.translation - rotation * origin * scale }
 }
 
 /// Support of the best pose that the remaining rays give, when it puts the set elsewhere.

@@ -1,11 +1,12 @@
 use std::f64::consts::{FRAC_PI_2, PI};
+use std::ops::Range;
 
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::kernel::{TwoNearest, distance2};
-use super::{Match, collect, passes};
-use crate::{ImageFeatures, Rays};
+use super::{Match, Parts, collect, match_simulated, passes};
+use crate::{DESCRIPTOR_LEN, ImageFeatures, Rays};
 
 /// How to match two images of known relative pose.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -23,13 +24,13 @@ pub struct GuidedParams {
 impl GuidedParams {
     /// Changes whenever the same parameters and inputs give other matches.
     ///
-    /// 1: band about the great circle, ratio and mutual test.
-    pub const VERSION: u32 = 1;
+    /// 1: band about the great circle, ratio and mutual test. 2: simulated views.
+    pub const VERSION: u32 = 2;
 }
 
 impl Default for GuidedParams {
     fn default() -> Self {
-        Self { ratio: 0.9, max_distance: 0.8, max_angle_rad: 0.004 }
+        Self { ratio: 0.85, max_distance: 0.6, max_angle_rad: 0.004 }
     }
 }
 
@@ -42,44 +43,69 @@ const MAX_SECTORS: usize = 2048;
 /// For each keypoint of the first only those of the second within `max_angle_rad` of the plane with normal E a are
 /// candidates; nearest, second nearest (ratio) and mutual tests are taken among candidates. The whole great circle
 /// counts, so that the sign of E does not matter: callers check depth signs afterwards. Degenerate E (zero) gives no
-/// matches. Matches come in the order of the first image's keypoints.
+/// matches. Matches come in ascending order; simulated views are treated as in [`super::match_features`].
 pub fn match_guided(
     params: &GuidedParams,
     first: (&ImageFeatures, &Rays),
     second: (&ImageFeatures, &Rays),
     second_from_first: &Matrix3<f64>,
 ) -> Vec<Match> {
-    let Some(sectors) = Sectors::new(&second.1.bearings, second_from_first, params.max_angle_rad) else {
-        return Vec::new();
-    };
-    let planes: Vec<Option<Vector3<f64>>> = first
-        .1
-        .bearings
+    if [first.0, second.0]
         .iter()
-        .map(|bearing| (second_from_first * bearing).try_normalize(f64::EPSILON))
-        .collect();
+        .any(|features| features.descriptors.len() != features.len() * DESCRIPTOR_LEN)
+    {
+        // Keypoints alone match nothing.
+        return Vec::new();
+    }
+    let of_views = |a: Parts, b: Parts| {
+        let mut found = Vec::new();
+        for (a, b) in a.into_iter().zip(b) {
+            match_parts_guided(params, (first, a), (second, b), second_from_first, &mut found);
+        }
+        found
+    };
+    let own = of_views(first.0.parts(), second.0.parts());
+    if first.0.simulated.is_empty() && second.0.simulated.is_empty() {
+        return own;
+    }
+    match_simulated(first.0, second.0, own, of_views)
+}
+
+type Part<'a> = ((&'a ImageFeatures, &'a Rays), Range<usize>);
+
+fn match_parts_guided(
+    params: &GuidedParams,
+    (first, a): Part<'_>,
+    (second, b): Part<'_>,
+    second_from_first: &Matrix3<f64>,
+    found: &mut Vec<Match>,
+) {
+    let (queries, others) = (&first.1.bearings[a.clone()], &second.1.bearings[b.clone()]);
+    let Some(sectors) = Sectors::new(others, second_from_first, params.max_angle_rad) else { return };
     let max_sine = params.max_angle_rad.sin();
-    let mut forward = vec![TwoNearest::NONE; first.0.len()];
-    let mut backward = vec![TwoNearest::NONE; second.0.len()];
-    for (index, plane) in planes.iter().enumerate().take(first.0.len()) {
-        let Some(plane) = plane else { continue };
-        let descriptor = first.0.descriptor(index);
-        for &candidate in sectors.candidates(plane) {
-            let bearing = &second.1.bearings[candidate as usize];
+    let mut forward = vec![TwoNearest::NONE; queries.len()];
+    let mut backward = vec![TwoNearest::NONE; others.len()];
+    for (index, bearing) in queries.iter().enumerate() {
+        let Some(plane) = (second_from_first * bearing).try_normalize(f64::EPSILON) else { continue };
+        let descriptor = first.0.descriptor(a.start + index);
+        for &candidate in sectors.candidates(&plane) {
+            let bearing = &others[candidate as usize];
             // Keypoints without a ray have the zero vector, which lies in every plane.
-            if bearing.dot(plane).abs() > max_sine || *bearing == Vector3::zeros() {
+            if bearing.dot(&plane).abs() > max_sine || *bearing == Vector3::zeros() {
                 continue;
             }
-            let distance2 = distance2(descriptor, second.0.descriptor(candidate as usize));
+            let distance2 = distance2(descriptor, second.0.descriptor(b.start + candidate as usize));
             forward[index].offer(candidate, distance2);
             backward[candidate as usize].offer(index as u32, distance2);
         }
     }
     let accepts = |nearest: &TwoNearest| passes(nearest, params.ratio, params.max_distance);
-    collect(&forward, accepts, |first, second| {
+    let matches = collect(&forward, accepts, |first, second| {
         let back = &backward[second as usize];
         back.index == first && accepts(back)
-    })
+    });
+    let (first, second) = (a.start as u32, b.start as u32);
+    found.extend(matches.iter().map(|m| Match { first: m.first + first, second: m.second + second }));
 }
 
 /// The second image's keypoints by azimuth about its epipole: every epipolar plane contains the epipole, so the
@@ -161,7 +187,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
-    use crate::{DESCRIPTOR_LEN, Keypoint};
+    use crate::Keypoint;
 
     struct Pair {
         first: (ImageFeatures, Rays),

@@ -3,11 +3,12 @@ mod avx512;
 mod guided;
 mod kernel;
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, FeatureError, ImageFeatures};
+use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, FeatureError, ImageFeatures, Keypoint};
 pub use guided::{GuidedParams, match_guided};
 pub use kernel::{DescriptorBlock, TwoNearest, two_nearest};
 
@@ -49,14 +50,17 @@ pub struct MatchParams {
     pub screen_features: usize,
     /// Least matches among those for which all keypoints are matched; with fewer, those matches are the result.
     pub screen_matches: usize,
+    /// With fewer matches than this between two images themselves, their simulated views are matched too. Matches of
+    /// simulated views are less exact, so they are for pairs that need them.
+    pub simulate_below: usize,
 }
 
 impl MatchParams {
     /// Changes whenever the same parameters and features give other matches.
     ///
     /// 1: exact two nearest neighbours, ratio and mutual test.
-    /// 2: bright and dark spots apart, screened by the strongest.
-    pub const VERSION: u32 = 2;
+    /// 2: bright and dark spots apart, screened by the strongest. 3: simulated views.
+    pub const VERSION: u32 = 3;
 
     /// Checks the ranges.
     ///
@@ -76,7 +80,14 @@ impl MatchParams {
 
 impl Default for MatchParams {
     fn default() -> Self {
-        Self { ratio: 0.8, mutual: true, max_distance: 1.0, screen_features: 2048, screen_matches: 28 }
+        Self {
+            ratio: 0.8,
+            mutual: true,
+            max_distance: 1.0,
+            screen_features: 2048,
+            screen_matches: 28,
+            simulate_below: 300,
+        }
     }
 }
 
@@ -97,7 +108,12 @@ fn passes(nearest: &TwoNearest, ratio: f64, max_distance: f64) -> bool {
 /// by chance (about 20 of 4096), and spare the other fifteen sixteenths of the work.
 /// Distances are exact integers and ties go to the lower index, so the result is the same on every processor. With
 /// `mutual` both images' keypoints must pass the ratio test. Single-threaded: callers work on many pairs in parallel.
-/// Matches come in the order of the first image's keypoints.
+/// Matches come in ascending order.
+///
+/// Simulated views are matched one by one, each with the other image itself, so that a keypoint does not compete in
+/// the ratio test with its own likes of other views. Of matches that say the same (both ends within
+/// [`SAME_PLACE_PX`]) one stays, for they are one piece of evidence: the images' own before a simulated view's, then
+/// the nearer.
 pub fn match_features(params: &MatchParams, first: &ImageFeatures, second: &ImageFeatures) -> Vec<Match> {
     let parts = |features: &ImageFeatures, most: usize| {
         features.parts().map(|part| part.start..part.end.min(part.start.saturating_add(most)))
@@ -111,7 +127,63 @@ pub fn match_features(params: &MatchParams, first: &ImageFeatures, second: &Imag
             return found;
         }
     }
-    match_all(params, (first, first.parts()), (second, second.parts()))
+    let own = match_all(params, (first, first.parts()), (second, second.parts()));
+    if own.len() >= params.simulate_below || (first.simulated.is_empty() && second.simulated.is_empty()) {
+        return own;
+    }
+    match_simulated(first, second, own, |a, b| match_all(params, (first, a), (second, b)))
+}
+
+type Parts = [Range<usize>; 2];
+
+/// Adds the matches of simulated views, each with the other image itself, to the images' own.
+fn match_simulated(
+    first: &ImageFeatures,
+    second: &ImageFeatures,
+    own: Vec<Match>,
+    of_views: impl Fn(Parts, Parts) -> Vec<Match>,
+) -> Vec<Match> {
+    let mut simulated = Vec::new();
+    simulated.extend(first.simulated_parts().flat_map(|a| of_views(a, second.parts())));
+    simulated.extend(second.simulated_parts().flat_map(|b| of_views(first.parts(), b)));
+    simulated.sort_by_cached_key(|m| {
+        let (a, b) = (first.descriptor(m.first as usize), second.descriptor(m.second as usize));
+        (kernel::distance2(a, b), *m)
+    });
+    let mut matches = distinct(first, second, own.into_iter().chain(simulated));
+    matches.sort_unstable();
+    matches
+}
+
+/// Ends of two matches that are nearer than this in both images are the same, in pixels.
+pub const SAME_PLACE_PX: f32 = 3.0;
+
+/// The first of each group of matches that say the same.
+fn distinct(first: &ImageFeatures, second: &ImageFeatures, found: impl Iterator<Item = Match>) -> Vec<Match> {
+    let cell = |x: f32, y: f32| ((x / SAME_PLACE_PX) as i32, (y / SAME_PLACE_PX) as i32);
+    let ends = |m: &Match| (&first.keypoints[m.first as usize], &second.keypoints[m.second as usize]);
+    let near = |a: &Keypoint, b: &Keypoint| (a.x - b.x).hypot(a.y - b.y) < SAME_PLACE_PX;
+    let mut kept_in: BTreeMap<(i32, i32), Vec<Match>> = BTreeMap::new();
+    let mut kept = Vec::new();
+    for candidate in found {
+        let (a, b) = ends(&candidate);
+        let (column, row) = cell(a.x, a.y);
+        let repeats = (column - 1..=column + 1).any(|column| {
+            (row - 1..=row + 1).any(|row| {
+                kept_in.get(&(column, row)).is_some_and(|others| {
+                    others.iter().any(|other| {
+                        let (c, d) = ends(other);
+                        near(a, c) && near(b, d)
+                    })
+                })
+            })
+        });
+        if !repeats {
+            kept_in.entry((column, row)).or_default().push(candidate);
+            kept.push(candidate);
+        }
+    }
+    kept
 }
 
 /// Matches some bright and some dark keypoints of two images.

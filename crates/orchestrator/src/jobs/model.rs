@@ -10,7 +10,8 @@ use serde_json::json;
 use setloc_features::{Camera, ImageFeatures, Match};
 use setloc_sfm::{
     CameraId, GeoregisterParams, ImageId, InputImage, MapperInput, MapperParams, MapperReport, PairGeometry,
-    QualityParams, Reconstruction, TwoView, assess, georegister, reconstruct, verify_pair,
+    PutativePair, QualityParams, Reconstruction, TwoViewParams, assess, georegister, reconstruct,
+    verify_pair,
 };
 
 use super::{choose_pairs, derived_seed};
@@ -52,7 +53,11 @@ pub fn add_model(
     config: &Config,
     seed: u64,
 ) -> Result<ModelJobs> {
-    let features = add_features_of(graph, images, config);
+    let params = match kind {
+        ModelKind::Scene => config.features.clone(),
+        ModelKind::Local => config.photo_features(),
+    };
+    let features = add_features_of(graph, images, &params);
     let mut pairs = Vec::new();
     for (a, b) in choose_pairs(&config.pairs, positions) {
         pairs.push((a, b, add_pair(graph, images, &features, (a, b), config, seed)?));
@@ -61,10 +66,11 @@ pub fn add_model(
     let placed: Vec<_> =
         cameras.of_image.iter().zip(positions).map(|(camera, position)| json!([camera, position])).collect();
     let params = json!({
-        "sfm": config.sfm, "quality": config.quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "camera_fixed": cameras.fixed,
+        "sfm": config.sfm, "two_view": config.two_view, "quality": config.quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "camera_fixed": cameras.fixed,
     });
     let stage = ModelConfig {
         mapper: config.sfm.clone(),
+        two_view: config.two_view.clone(),
         quality: config.quality.clone(),
         georegistration: config.georegistration.clone(),
     };
@@ -88,14 +94,19 @@ pub fn add_model(
         graph.accept(model, features_role(at), *used);
     }
     for (a, b, used) in pairs {
-        graph.accept(model, pair_role(a, b), used);
+        graph.accept(model, pair_role(a, b), used.verified);
+        graph.accept(model, matches_role(a, b), used.matches);
     }
     Ok(ModelJobs { features, model })
 }
 
 /// Adds decoding and extraction of each image.
-pub fn add_features_of(graph: &mut JobGraph<'_>, images: &[SourceImage], config: &Config) -> Vec<JobId> {
-    images.iter().map(|image| add_features(graph, image, config)).collect()
+pub fn add_features_of(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    params: &stages::FeatureParams,
+) -> Vec<JobId> {
+    images.iter().map(|image| add_features(graph, image, params)).collect()
 }
 
 fn features_role(at: usize) -> String {
@@ -106,12 +117,16 @@ fn pair_role(a: usize, b: usize) -> String {
     format!("pair {a:04} {b:04}")
 }
 
+fn matches_role(a: usize, b: usize) -> String {
+    format!("matches {a:04} {b:04}")
+}
+
 /// Pair jobs go by content, not by order of names, so that renaming an image changes nothing.
 fn is_swapped(images: &[SourceImage], a: usize, b: usize) -> bool {
     images[b].hash < images[a].hash
 }
 
-fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, config: &Config) -> JobId {
+fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, features: &stages::FeatureParams) -> JobId {
     let mut external = BTreeMap::from([("image".to_owned(), image.hash)]);
     let mask = image.mask.clone();
     if let Some((_, hash)) = &mask {
@@ -119,9 +134,9 @@ fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, config: &Config) 
     }
     // Decoded pixels and six layers of the doubled image in floats, half of them with their smaller octaves.
     let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 128;
-    let params = json!({ "features": config.features, "camera": image.camera });
+    let params = json!({ "features": features, "camera": image.camera });
     let (path, hash, camera, features) =
-        (image.path.clone(), image.hash, image.camera.clone(), config.features.clone());
+        (image.path.clone(), image.hash, image.camera.clone(), features.clone());
     let work = move |_: &Inputs<'_, '_>| {
         let bytes = read_unchanged(&path, hash)?;
         let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
@@ -145,7 +160,14 @@ fn read_unchanged(path: &Path, hash: ContentHash) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Adds matching and verification of one pair; returns the verification.
+/// The jobs of one pair.
+#[derive(Clone, Copy)]
+struct PairJobs {
+    matches: JobId,
+    verified: JobId,
+}
+
+/// Adds matching and verification of one pair.
 fn add_pair(
     graph: &mut JobGraph<'_>,
     images: &[SourceImage],
@@ -153,7 +175,7 @@ fn add_pair(
     (a, b): (usize, usize),
     config: &Config,
     seed: u64,
-) -> Result<JobId> {
+) -> Result<PairJobs> {
     let name = format!("{} {}", images[a].name, images[b].name);
     let (a, b) = if is_swapped(images, a, b) { (b, a) } else { (a, b) };
     let matching = config.matching.clone();
@@ -193,7 +215,7 @@ fn add_pair(
         graph.require(job, "second", features[b]);
     }
     graph.require(verified, "matches", matches);
-    Ok(verified)
+    Ok(PairJobs { matches, verified })
 }
 
 /// Cameras shared by the images that have the same one.
@@ -221,6 +243,7 @@ fn share_cameras(images: &[SourceImage]) -> SharedCameras {
 /// Parameters of the mapping job.
 struct ModelConfig {
     mapper: MapperParams,
+    two_view: TwoViewParams,
     quality: QualityParams,
     georegistration: GeoregisterParams,
 }
@@ -237,7 +260,7 @@ fn run_model(
     input: &ModelInput<'_>,
     seed: u64,
 ) -> Result<Product> {
-    let ModelConfig { mapper: params, quality, georegistration } = config;
+    let ModelConfig { mapper: params, two_view, quality, georegistration } = config;
     let mut features: Vec<(usize, Arc<ImageFeatures>)> = Vec::new();
     let mut id_of = BTreeMap::new();
     for at in 0..input.positions.len() {
@@ -246,12 +269,17 @@ fn run_model(
             features.push((at, found));
         }
     }
-    let mut pairs = Vec::new();
+    let (mut pairs, mut putative) = (Vec::new(), Vec::new());
     for &(a, b, swapped) in input.pairs {
+        let matches = inputs.find::<PairMatches>(&matches_role(a, b))?;
+        if let (Some(matches), Some(&first), Some(&second)) = (matches, id_of.get(&a), id_of.get(&b)) {
+            let turned = |m: &Match| if swapped { Match { first: m.second, second: m.first } } else { *m };
+            putative.push(PutativePair { first, second, matches: matches.0.iter().map(turned).collect() });
+        }
         let verified = inputs.find::<VerifiedPair>(&pair_role(a, b))?;
         if let (Some(verified), Some(&first), Some(&second)) = (verified, id_of.get(&a), id_of.get(&b)) {
             for two_view in &verified.0 {
-                let two_view = if swapped { flip(two_view) } else { two_view.clone() };
+                let two_view = if swapped { two_view.flipped() } else { two_view.clone() };
                 pairs.push(PairGeometry { first, second, two_view });
             }
         }
@@ -262,11 +290,20 @@ fn run_model(
         camera: CameraId(input.cameras.of_image[*at] as u32),
         features,
         position_prior: input.positions[*at],
+        mosaic: None,
     });
     let images = images.collect();
     let (cameras, camera_fixed) = (input.cameras.cameras.clone(), input.cameras.fixed.clone());
     let positions: Vec<Option<Vector3<f64>>> = features.iter().map(|(at, _)| input.positions[*at]).collect();
-    let mut output = reconstruct(params, &MapperInput { cameras, camera_fixed, images, pairs: &pairs }, seed);
+    let input_of_mapper = MapperInput {
+        cameras,
+        camera_fixed,
+        images,
+        pairs: &pairs,
+        putative: &putative,
+        two_view: two_view.clone(),
+    };
+    let mut output = reconstruct(params, &input_of_mapper, seed);
     for (at, component) in output.components.iter_mut().enumerate() {
         let report = assess(quality, component, &pairs);
         output.report.warnings.extend(report.sentences(component));
@@ -341,14 +378,6 @@ pub(super) fn with_names(text: &str, names: &[String]) -> String {
         }
     }
     out
-}
-
-/// The same geometry with the two images exchanged.
-fn flip(two_view: &TwoView) -> TwoView {
-    let mut inliers: Vec<Match> =
-        two_view.inliers.iter().map(|m| Match { first: m.second, second: m.first }).collect();
-    inliers.sort_unstable();
-    TwoView { second_from_first: two_view.second_from_first.inverse(), inliers, ..two_view.clone() }
 }
 
 #[cfg(test)]

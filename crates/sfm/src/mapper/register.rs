@@ -1,9 +1,11 @@
 use nalgebra::Vector3;
+use setloc_features::{GuidedParams, match_guided};
 
-use super::{correspondence::CorrespondenceGraph, direction, model::Model};
+use super::{correspondence::CorrespondenceGraph, direction, model::Model, standpoint::in_view};
 use crate::{
-    ImageId, Observation, PointId, Rigid, TwoViewKind,
+    ImageId, Observation, PairGeometry, PointId, Rigid, TwoViewKind,
     robust::{RansacParams, estimate_absolute_pose, refine_absolute_pose},
+    solvers::essential::essential_from_pose,
     visibility::is_same_view,
 };
 
@@ -113,6 +115,10 @@ pub(super) fn hypothesize(
     hypotheses
 }
 
+/// Points from which a pose is determined better than by the pair: fewer, and mostly in one corner, only give the
+/// length of the baseline.
+const FREE_POSE_POINTS: usize = 15;
+
 /// Poses that single verified pairs suggest, best supported first: rotation and direction are the pair's, the length of
 /// the baseline is the median over the 2D-to-3D matches.
 ///
@@ -175,7 +181,7 @@ pub(super) fn hypothesize_from_pairs(
         let mut found = Rigid::new(world_from_image.rotation, pose.center() + step * length);
         for widening in [6.0, 3.0, 1.0] {
             let near = agreeing(&found, widening * params.max_error_sigma);
-            if near.len() >= params.min_inliers {
+            if near.len() >= FREE_POSE_POINTS {
                 found = refine_absolute_pose(params, &bearings, &sigmas, &points, &near, &found);
             }
         }
@@ -193,6 +199,76 @@ pub(super) fn hypothesize_from_pairs(
     }
     hypotheses.sort_by_key(|hypothesis| std::cmp::Reverse(hypothesis.inliers.len()));
     hypotheses
+}
+
+/// Fewest points that must agree on the length of a baseline.
+const MIN_BASELINE_POINTS: usize = 8;
+/// How many times more points must agree on it than on any other length.
+const BASELINE_LEAD: f64 = 2.5;
+/// Lengths by less than this factor apart are one.
+const SAME_LENGTH: f64 = 1.25;
+
+/// The pose of `image` from its verified pair with the registered image `other`, the length of the baseline from
+/// matches along the pair's epipolar circles; `None` unless one length stands out.
+pub(super) fn hypothesize_baseline(
+    model: &Model<'_>,
+    pair: &PairGeometry,
+    image: ImageId,
+    other: ImageId,
+    params: &RansacParams,
+) -> Option<PoseHypothesis> {
+    let pose = model.poses[other.index()].as_ref()?;
+    let second_from_first = pair.two_view.second_from_first;
+    let image_from_other = if image == pair.second { second_from_first } else { second_from_first.inverse() };
+    let world_from_image = pose.world_from_camera * image_from_other.inverse();
+    let step = world_from_image.translation - pose.center();
+    let features = |image: ImageId| (model.input.images[image.index()].features, &model.rays[image.index()]);
+    let guided = match_guided(
+        &GuidedParams::default(),
+        features(other),
+        features(image),
+        &essential_from_pose(&image_from_other),
+    );
+    let rays = &model.rays[image.index()];
+    let mut candidates: Vec<(u32, PointId, Vector3<f64>)> = Vec::new();
+    let mut lengths: Vec<f64> = Vec::new();
+    for m in &guided {
+        let Some(id) = model.point_of(Observation { image: other, feature: m.first }) else { continue };
+        let Some(point) = model.point(id) else { continue };
+        let ray = world_from_image.rotation * rays.bearings[m.second as usize];
+        let (wanted, lever) = ((point.position - pose.center()).cross(&ray), step.cross(&ray));
+        let length = wanted.dot(&lever) / lever.norm_squared();
+        if length.is_finite() && length > 0.0 && rays.sigmas[m.second as usize].is_finite() {
+            candidates.push((m.second, id, point.position));
+            lengths.push(length);
+        }
+    }
+    let agreeing = |length: f64| -> Vec<usize> {
+        let center = pose.center() + step * length;
+        let agrees = |&at: &usize| {
+            let (feature, _, position) = &candidates[at];
+            let direction = world_from_image.rotation.inverse_transform_vector(&(position - center));
+            let error = (direction.normalize() - rays.bearings[*feature as usize]).norm();
+            error <= params.max_error_sigma * rays.sigmas[*feature as usize]
+        };
+        (0..candidates.len()).filter(agrees).collect()
+    };
+    let mut counts: Vec<(usize, f64)> =
+        lengths.iter().map(|&length| (agreeing(length).len(), length)).collect();
+    counts.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.total_cmp(&b.1)));
+    let &(most, length) = counts.first()?;
+    let runner_up = counts
+        .iter()
+        .find(|(_, other)| (other / length).max(length / other) > SAME_LENGTH)
+        .map_or(0, |&(count, _)| count);
+    if most < MIN_BASELINE_POINTS || (most as f64) < BASELINE_LEAD * runner_up as f64 {
+        return None;
+    }
+    let found = Rigid::new(world_from_image.rotation, pose.center() + step * length);
+    let inliers: Vec<(u32, PointId)> =
+        agreeing(length).into_iter().map(|at| (candidates[at].0, candidates[at].1)).collect();
+    let visibility = visibility(model, image, &found, &inliers);
+    Some(PoseHypothesis { world_from_camera: found, inliers, candidates: candidates.len(), visibility })
 }
 
 /// Points in plain view that make a direction worth judging.
@@ -222,15 +298,11 @@ pub(super) fn visibility(
         if !familiar {
             continue;
         }
-        let in_image = camera.is_panoramic()
-            || camera.project(&world_from_camera.inverse_transform_point(&point.position)).is_some_and(
-                |pixel| {
-                    pixel.x >= 0.0
-                        && pixel.y >= 0.0
-                        && pixel.x < f64::from(camera.width)
-                        && pixel.y < f64::from(camera.height)
-                },
-            );
+        let direction = world_from_camera.inverse_transform_point(&point.position);
+        let in_image = match model.input.images[image.index()].mosaic {
+            Some(mosaic) => mosaic.covers(&direction),
+            None => in_view(camera, &direction),
+        };
         if in_image {
             counts.expected += 1;
             counts.matched += usize::from(is_inlier[id.index()]);
