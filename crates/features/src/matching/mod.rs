@@ -112,7 +112,7 @@ fn passes(nearest: &TwoNearest, ratio: f64, max_distance: f64) -> bool {
 ///
 /// Simulated views are matched one by one, each with the other image itself, so that a keypoint does not compete in
 /// the ratio test with its own likes of other views. Of matches that say the same (both ends within
-/// [`SAME_PLACE_PX`]) one stays, for they are one piece of evidence: the images' own before a simulated view's, then
+/// 3 pixels) one stays, for they are one piece of evidence: the images' own before a simulated view's, then
 /// the nearer.
 pub fn match_features(params: &MatchParams, first: &ImageFeatures, second: &ImageFeatures) -> Vec<Match> {
     let parts = |features: &ImageFeatures, most: usize| {
@@ -156,7 +156,7 @@ fn match_simulated(
 }
 
 /// Ends of two matches that are nearer than this in both images are the same, in pixels.
-pub const SAME_PLACE_PX: f32 = 3.0;
+const SAME_PLACE_PX: f32 = 3.0;
 
 /// The first of each group of matches that say the same.
 fn distinct(first: &ImageFeatures, second: &ImageFeatures, found: impl Iterator<Item = Match>) -> Vec<Match> {
