@@ -19,8 +19,9 @@ fn build_and_signal(folder: &Path, panoramas: &str, signal: &str, delay: Duratio
     while begun.elapsed() < delay && child.try_wait().unwrap().is_none() {
         std::thread::sleep(Duration::from_millis(1));
     }
-    let pid = child.id().to_string();
-    std::process::Command::new("kill").args(["-s", signal, &pid]).stderr(Stdio::null()).status().unwrap();
+    // The shell's own `kill`: small systems have no such program.
+    let send = format!("kill -s {signal} {}", child.id());
+    std::process::Command::new("sh").args(["-c", &send]).stderr(Stdio::null()).status().unwrap();
     child.wait().unwrap().code()
 }
 
