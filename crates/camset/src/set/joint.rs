@@ -107,7 +107,13 @@ impl Component<'_> {
         }
         let joint = self.refine_jointly(&set_from_camera, &candidates, &rigid);
         evidence.log10_false_alarms = evidence.log10_false_alarms.min(self.joint_false_alarms(&joint));
-        let support = judge_support(&params.verdict, &evidence, &mut reasons);
+        let mut support = judge_support(&params.verdict, &evidence, &mut reasons);
+        let elsewhere = seen_from_elsewhere(&set_from_camera, &candidates, &rigid.agreeing);
+        // One standpoint's matches place that standpoint; a few chance matches of the others then fit some scale.
+        if elsewhere < params.verdict.min_inliers / 2 {
+            reasons.push(format!("its scale rests on {elsewhere} matches seen from elsewhere than the rest"));
+            support = weaker(support, Verdict::Uncertain);
+        }
         let refined = self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
         let undetermined = rigid.observability.undetermined();
         let mut rigid_support = support;
@@ -518,4 +524,45 @@ fn unique(mut matches: Vec<SceneMatch>) -> Vec<SceneMatch> {
     matches.sort_unstable();
     matches.dedup_by_key(|m| m.feature);
     matches
+}
+
+/// Number of agreeing correspondences with a ray from another place than the photo that has most of them.
+fn seen_from_elsewhere(
+    set_from_camera: &[Rigid],
+    candidates: &[SetCorrespondence],
+    agreeing: &[usize],
+) -> usize {
+    let mut seen = vec![0_usize; set_from_camera.len()];
+    for &(slot, _) in agreeing.iter().flat_map(|&number| &candidates[number].seen_by) {
+        seen[slot] += 1;
+    }
+    let Some(main) = (0..seen.len()).max_by_key(|&slot| seen[slot]) else { return 0 };
+    let center = set_from_camera[main].translation;
+    let is_elsewhere = |&number: &&usize| {
+        candidates[*number].seen_by.iter().any(|&(slot, _)| set_from_camera[slot].translation != center)
+    };
+    agreeing.iter().filter(is_elsewhere).count()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{UnitQuaternion, Vector3};
+    use setloc_sfm::PointId;
+
+    use super::*;
+
+    #[test]
+    fn matches_of_one_standpoint_say_nothing_of_scale() {
+        let at = |x: f64| Rigid::new(UnitQuaternion::identity(), Vector3::new(x, 0.0, 0.0));
+        let poses = [at(0.0), at(0.0), at(1.0)];
+        let seen_by = |slots: &[usize]| SetCorrespondence {
+            scene: PointId(0),
+            local: None,
+            seen_by: slots.iter().map(|&slot| (slot, 0)).collect(),
+        };
+        let candidates = [seen_by(&[0]), seen_by(&[0]), seen_by(&[1]), seen_by(&[2]), seen_by(&[0, 2])];
+        assert_eq!(seen_from_elsewhere(&poses, &candidates, &[0, 1, 2]), 0);
+        assert_eq!(seen_from_elsewhere(&poses, &candidates, &[0, 1, 2, 3, 4]), 2);
+        assert_eq!(seen_from_elsewhere(&poses, &candidates, &[]), 0);
+    }
 }
