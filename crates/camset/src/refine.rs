@@ -34,6 +34,10 @@ pub(crate) struct JointPhoto {
     /// Index into [`JointModel::cameras`].
     pub camera: usize,
     pub world_from_camera: Rigid,
+    /// Slot of the first photo that was taken from the same centre (its own when there is no other).
+    ///
+    /// Photos of one standpoint keep their turns and move together: what they share tells nothing of their distance.
+    pub standpoint: usize,
 }
 
 /// Slot `photo` of a joint model sees local point `point` with one of its features.
@@ -63,6 +67,7 @@ pub(crate) fn refine_jointly(
     let mut observations = Vec::with_capacity(tracks.len() + direct.iter().map(Vec::len).sum::<usize>());
     let mut support = vec![0_usize; model.cameras.len()];
     let mut observed = vec![0_usize; model.photos.len()];
+    let standpoints = Standpoints::new(&model.photos);
     for (slot, matches) in direct.iter().enumerate() {
         let photo = &model.photos[slot];
         for &found in matches {
@@ -70,26 +75,16 @@ pub(crate) fn refine_jointly(
                 points.push(BundlePoint { position: index.position(found.point), fixed: false });
                 points.len() as u32 - 1
             });
-            observations.push(BundleObservation {
-                pose: slot as u32,
-                point,
-                pixel: rays[slot].features.keypoints[found.feature as usize].pixel(),
-                noise_px: f64::from(rays[slot].features.keypoints[found.feature as usize].noise_px),
-            });
+            observations.extend(standpoints.observation(rays, slot, found.feature, point));
         }
         support[photo.camera] += matches.len();
-        observed[slot] += matches.len();
+        observed[photo.standpoint] += matches.len();
     }
     for track in tracks {
-        let keypoint = &rays[track.photo].features.keypoints[track.feature as usize];
-        observations.push(BundleObservation {
-            pose: track.photo as u32,
-            point: track.point as u32,
-            pixel: keypoint.pixel(),
-            noise_px: f64::from(keypoint.noise_px),
-        });
-        support[model.photos[track.photo].camera] += 1;
-        observed[track.photo] += 1;
+        let photo = &model.photos[track.photo];
+        observations.extend(standpoints.observation(rays, track.photo, track.feature, track.point as u32));
+        support[photo.camera] += 1;
+        observed[photo.standpoint] += 1;
     }
     let camera_freedom = support
         .iter()
@@ -106,14 +101,15 @@ pub(crate) fn refine_jointly(
         .photos
         .iter()
         .zip(&observed)
-        .map(|(photo, &observed)| BundlePose {
-            camera: photo.camera as u32,
+        .enumerate()
+        .map(|(slot, (photo, &observed))| BundlePose {
+            camera: if standpoints.shared[slot] { model.cameras.len() } else { photo.camera } as u32,
             world_from_camera: photo.world_from_camera,
             fixed: observed < 3,
         })
         .collect();
     let mut cameras = model.cameras.clone();
-    cameras.push(Camera::equirectangular(FAR_WIDTH, FAR_WIDTH / 2));
+    cameras.push(sphere());
     for (&scene_point, &point) in &scene_points {
         let covariance = index.position_covariance(scene_point);
         for prior in prior_bearings(&index.position(scene_point), &covariance) {
@@ -135,8 +131,9 @@ pub(crate) fn refine_jointly(
     for (camera, refined) in model.cameras.iter_mut().zip(&problem.cameras) {
         camera.clone_from(refined);
     }
-    for (photo, pose) in model.photos.iter_mut().zip(&problem.poses) {
-        photo.world_from_camera = pose.world_from_camera;
+    for (slot, photo) in model.photos.iter_mut().enumerate() {
+        let lead = problem.poses[photo.standpoint].world_from_camera;
+        photo.world_from_camera = Rigid::new(lead.rotation * standpoints.turn[slot], lead.translation);
     }
     for (point, refined) in model.points.iter_mut().zip(&problem.points) {
         *point = refined.position;
@@ -145,10 +142,74 @@ pub(crate) fn refine_jointly(
         return vec![None; model.photos.len()];
     }
     // What is left are inliers: each counts in full.
-    covariances(&problem, model.photos.len(), RobustLoss::Trivial)
+    let of_leads = covariances(&problem, model.photos.len(), RobustLoss::Trivial);
+    (0..model.photos.len())
+        .map(|slot| Some(turned(of_leads[model.photos[slot].standpoint]?, &standpoints.turn[slot])))
+        .collect()
 }
 
-/// Width in pixels of the far cameras' images; their pixels only express angles.
+/// Covariance of a pose whose camera is turned: R·Exp(ω)·T = R·T·Exp(Tᵀω), and the centre is the same.
+fn turned(covariance: Matrix6<f64>, turn: &UnitQuaternion<f64>) -> Matrix6<f64> {
+    let mut jacobian = Matrix6::identity();
+    jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(turn.inverse().to_rotation_matrix().matrix());
+    jacobian * covariance * jacobian.transpose()
+}
+
+/// Which photos share a centre, and how they are turned against the first of them.
+struct Standpoints {
+    /// Slot of each photo's first.
+    lead: Vec<usize>,
+    /// Turn from each photo's frame into that of its first.
+    turn: Vec<UnitQuaternion<f64>>,
+    /// Whether a photo shares its centre with another.
+    shared: Vec<bool>,
+    sphere: Camera,
+}
+
+impl Standpoints {
+    fn new(photos: &[JointPhoto]) -> Self {
+        let lead: Vec<usize> = photos.iter().map(|photo| photo.standpoint).collect();
+        let mut members = vec![0_usize; photos.len()];
+        for &lead in &lead {
+            members[lead] += 1;
+        }
+        let turn = photos
+            .iter()
+            .enumerate()
+            .map(|(slot, photo)| match photo.standpoint {
+                lead if lead == slot => UnitQuaternion::identity(),
+                lead => photos[lead].world_from_camera.rotation.inverse() * photo.world_from_camera.rotation,
+            })
+            .collect();
+        let shared = lead.iter().map(|&lead| members[lead] > 1).collect();
+        Self { lead, turn, shared, sphere: sphere() }
+    }
+
+    /// The observation of a bundle point by a photo's feature, of the standpoint's pose where the centre is shared.
+    fn observation(
+        &self,
+        rays: &[PhotoRays<'_>],
+        slot: usize,
+        feature: u32,
+        point: u32,
+    ) -> Option<BundleObservation> {
+        let keypoint = &rays[slot].features.keypoints[feature as usize];
+        let (mut pixel, mut noise_px) = (keypoint.pixel(), f64::from(keypoint.noise_px));
+        if self.shared[slot] {
+            let seen = &rays[slot].rays;
+            pixel = self.sphere.project(&(self.turn[slot] * seen.bearings[feature as usize]))?;
+            noise_px = seen.sigmas[feature as usize] / self.sphere.pixel_angle(&pixel)?;
+        }
+        Some(BundleObservation { pose: self.lead[slot] as u32, point, pixel, noise_px })
+    }
+}
+
+/// A camera that sees all around; its pixels only express angles.
+fn sphere() -> Camera {
+    Camera::equirectangular(FAR_WIDTH, FAR_WIDTH / 2)
+}
+
+/// Width in pixels of the images of cameras that see all around.
 const FAR_WIDTH: u32 = 4096;
 /// Distance of the far cameras from their point, in its largest standard deviations.
 const FAR: f64 = 1e3;
@@ -225,6 +286,20 @@ fn covariances(problem: &BundleProblem, photos: usize, loss: RobustLoss) -> Vec<
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_covariance_of_a_turned_camera_is_that_of_its_own_axes() {
+        let turn = UnitQuaternion::from_euler_angles(0.3, -0.8, 1.2);
+        let factor = Matrix6::from_fn(|row, column| 0.1 * ((3 * row + 5 * column) % 7) as f64);
+        let covariance = factor * factor.transpose();
+        // A draw x of covariance aaᵀ for each column a of the factor, seen by the turned camera.
+        let seen = Matrix6::from_columns(&[0, 1, 2, 3, 4, 5].map(|k| {
+            let (spin, shift) = (factor.fixed_view::<3, 1>(0, k), factor.fixed_view::<3, 1>(3, k));
+            let spin = turn.inverse() * spin.into_owned();
+            nalgebra::Vector6::new(spin.x, spin.y, spin.z, shift[0], shift[1], shift[2])
+        }));
+        assert!((turned(covariance, &turn) - seen * seen.transpose()).norm() < 1e-12);
+    }
 
     #[test]
     fn far_bearings_carry_the_information_of_the_covariance() {

@@ -4,7 +4,7 @@ mod correspondences;
 mod joint;
 mod rigid;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use rayon::prelude::*;
 use setloc_index::NearestPoints;
@@ -113,17 +113,31 @@ pub fn locate_set(
     answer
 }
 
-/// Number of local points that each pair of photos shares, by image ids in ascending order.
+/// Number of local points that tie each pair of photos, by image ids in ascending order.
+///
+/// Two photos from one centre move together: each point that either of them sees ties both.
 fn shared_points(model: &Reconstruction) -> BTreeMap<(usize, usize), usize> {
+    let center = |photo: usize| model.images[photo].world_from_camera.map(|pose| pose.translation);
+    let registered: Vec<usize> = model.registered().map(ImageId::index).collect();
+    let turned: Vec<(usize, usize)> = registered
+        .iter()
+        .enumerate()
+        .flat_map(|(i, &first)| registered[i + 1..].iter().map(move |&second| (first, second)))
+        .filter(|&(first, second)| center(first) == center(second))
+        .collect();
     let mut shared = BTreeMap::new();
     for point in &model.points {
         let mut photos: Vec<usize> = point.track.iter().map(|o| o.image.index()).collect();
         photos.sort_unstable();
         photos.dedup();
+        let mut tied: BTreeSet<(usize, usize)> = BTreeSet::new();
         for (i, &first) in photos.iter().enumerate() {
-            for &second in &photos[i + 1..] {
-                *shared.entry((first, second)).or_default() += 1;
-            }
+            tied.extend(photos[i + 1..].iter().map(|&second| (first, second)));
+        }
+        let sees = |photo: usize| photos.binary_search(&photo).is_ok();
+        tied.extend(turned.iter().filter(|&&(first, second)| sees(first) || sees(second)));
+        for pair in tied {
+            *shared.entry(pair).or_default() += 1;
         }
     }
     shared
@@ -226,6 +240,27 @@ mod tests {
         for (i, photo) in found.rigid.iter().enumerate() {
             assert_ne!(photo.verdict, Verdict::Localized);
             assert!(photo.reasons.iter().any(|reason| reason.contains("scale")), "{i}: {:?}", photo.reasons);
+        }
+    }
+
+    #[test]
+    fn photos_of_one_standpoint_stay_together() {
+        let place = Place::street(3500, 11);
+        let poses: Vec<_> = (0..8)
+            .map(|i| {
+                let center = Vector3::new(0.5, -1.5, 20.0 + 6.0 * f64::from(i / 2));
+                along_street(center, if i % 2 == 0 { -0.1 } else { 0.9 })
+            })
+            .collect();
+        let world = World::new(&place, &poses, 0.2, 11);
+        let found = locate(&world, &CamsetParams::default());
+        let (center, rotation) = worst_errors(&world, &found.refined);
+        assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
+        for turned in found.refined.chunks(2) {
+            let [a, b] = [0, 1].map(|i| turned[i].world_from_camera.unwrap());
+            assert!((a.translation - b.translation).norm() < 1e-12, "{a:?} {b:?}");
+            assert!((a.rotation.angle_to(&b.rotation) - 1.0).abs() < 1e-6);
+            assert_eq!(turned.iter().filter(|photo| photo.verdict == Verdict::Localized).count(), 2);
         }
     }
 

@@ -115,7 +115,7 @@ fn solve(
     let mut model = JointModel {
         cameras: vec![best.camera],
         camera_fixed: vec![photo.camera_fixed],
-        photos: vec![JointPhoto { camera: 0, world_from_camera: best.pose }],
+        photos: vec![JointPhoto { camera: 0, world_from_camera: best.pose, standpoint: 0 }],
         points: Vec::new(),
     };
     refine(&mut model, scene.index, photo, matches, params.max_error_sigmas, false);

@@ -227,6 +227,7 @@ impl Component<'_> {
                 .map(|(slot, pose)| JointPhoto {
                     camera: self.camera_of(slot),
                     world_from_camera: world_from_set.transform_pose(pose),
+                    standpoint: standpoint(set_from_camera, slot),
                 })
                 .collect(),
             points: self
@@ -459,16 +460,17 @@ impl Component<'_> {
                     ));
                     verdict = weaker(verdict, Verdict::Uncertain);
                 }
-                let alone = &self.evidence[photo].alone;
-                if let Some(other) = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized) {
-                    // The photo's own matches are evidence that the set's pose did not create.
-                    if same_pose(&pose, &other, depth) {
+                match self.seen_alone(&joint.model.photos, slot, depth) {
+                    // The photos' own matches are evidence that the set's pose did not create.
+                    Some(true) => {
                         reasons.push("localized alone, it stands at the same place".to_owned());
                         verdict = Verdict::Localized;
-                    } else {
+                    }
+                    Some(false) => {
                         reasons.push("localized alone, it stands elsewhere".to_owned());
                         verdict = Verdict::Uncertain;
                     }
+                    None => {}
                 }
                 let verdict = weaker(verdict, precision);
                 PhotoLocalization {
@@ -482,6 +484,18 @@ impl Component<'_> {
                 }
             })
             .collect()
+    }
+
+    /// Whether the photo, or another of its standpoint, stands at the same place when localized alone; `None` when
+    /// none is.
+    fn seen_alone(&self, joint: &[JointPhoto], slot: usize, depth: f64) -> Option<bool> {
+        let agreements = joint.iter().zip(self.members).filter_map(|(photo, &member)| {
+            let alone = &self.evidence[member].alone;
+            let other = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized)?;
+            (photo.standpoint == joint[slot].standpoint)
+                .then(|| same_pose(&photo.world_from_camera, &other, depth))
+        });
+        agreements.reduce(|a, b| a && b)
     }
 
     /// Median distance from a photo to the scene points that it sees, else to its local points.
@@ -517,6 +531,12 @@ fn agreeing_tracks(
     });
     agreeing.retain(|track| seen[track.point] >= 2);
     agreeing
+}
+
+/// First photo with the same centre; the mapper gives photos of one standpoint exactly one.
+fn standpoint(set_from_camera: &[Rigid], slot: usize) -> usize {
+    let center = set_from_camera[slot].translation;
+    (0..slot).find(|&other| set_from_camera[other].translation == center).unwrap_or(slot)
 }
 
 /// Each feature once, by its first match; sorted.
