@@ -144,12 +144,12 @@ pub(crate) fn refine_jointly(
     // What is left are inliers: each counts in full.
     let of_leads = covariances(&problem, model.photos.len(), RobustLoss::Trivial);
     (0..model.photos.len())
-        .map(|slot| Some(turned(of_leads[model.photos[slot].standpoint]?, &standpoints.turn[slot])))
+        .map(|slot| Some(turned(of_leads[model.photos[slot].standpoint].as_ref()?, &standpoints.turn[slot])))
         .collect()
 }
 
 /// Covariance of a pose whose camera is turned: R·Exp(ω)·T = R·T·Exp(Tᵀω), and the centre is the same.
-fn turned(covariance: Matrix6<f64>, turn: &UnitQuaternion<f64>) -> Matrix6<f64> {
+fn turned(covariance: &Matrix6<f64>, turn: &UnitQuaternion<f64>) -> Matrix6<f64> {
     let mut jacobian = Matrix6::identity();
     jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(turn.inverse().to_rotation_matrix().matrix());
     jacobian * covariance * jacobian.transpose()
@@ -298,7 +298,7 @@ mod tests {
             let spin = turn.inverse() * spin.into_owned();
             nalgebra::Vector6::new(spin.x, spin.y, spin.z, shift[0], shift[1], shift[2])
         }));
-        assert!((turned(covariance, &turn) - seen * seen.transpose()).norm() < 1e-12);
+        assert!((turned(&covariance, &turn) - seen * seen.transpose()).norm() < 1e-12);
     }
 
     #[test]

@@ -26,6 +26,9 @@ const WIDENING: [f64; 3] = [2.5, 1.5, 1.0];
 /// Share of the rigid pose's correspondences that the joint refinement has to bring within the inlier bound.
 const MIN_KEPT: f64 = 0.5;
 
+/// Fewest matches seen from elsewhere than the rest that give a set its scale at all.
+const MIN_FOR_SCALE: usize = 3;
+
 /// What became of one local model.
 pub(crate) enum ComponentAnswer {
     Localized(Box<ComponentPoses>),
@@ -63,6 +66,36 @@ struct Joint {
     /// Scene points that each photo sees itself, within the inlier bound.
     direct: Vec<Vec<SceneMatch>>,
     covariances: Vec<Option<Matrix6<f64>>>,
+}
+
+impl Joint {
+    /// The standpoint whose photos see most of the scene.
+    fn main_standpoint(&self) -> usize {
+        let mut seen = vec![0_usize; self.direct.len()];
+        for (photo, direct) in self.model.photos.iter().zip(&self.direct) {
+            seen[photo.standpoint] += direct.len();
+        }
+        (0..seen.len()).max_by_key(|&slot| (seen[slot], std::cmp::Reverse(slot))).unwrap_or(0)
+    }
+
+    /// Slots of the photos that were not taken from there.
+    fn away_from_main(&self) -> Vec<usize> {
+        let main = self.main_standpoint();
+        (0..self.direct.len()).filter(|&slot| self.model.photos[slot].standpoint != main).collect()
+    }
+
+    /// Scene points that those see.
+    fn seen_from_elsewhere(&self) -> usize {
+        self.away_from_main().into_iter().map(|slot| self.direct[slot].len()).sum()
+    }
+}
+
+/// Takes back a pose that only a scale out of thin air could give.
+fn refuse_without_scale(photo: &mut PhotoLocalization) {
+    photo.world_from_camera = None;
+    photo.covariance = None;
+    photo.verdict = Verdict::NotLocalized;
+    photo.reasons.push("how far it is from the photo that sees the scene is not known".to_owned());
 }
 
 /// Observations of one round of the joint refinement.
@@ -114,7 +147,14 @@ impl Component<'_> {
             reasons.push(format!("its scale rests on {elsewhere} matches seen from elsewhere than the rest"));
             support = weaker(support, Verdict::Uncertain);
         }
-        let refined = self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
+        let mut refined = self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
+        let mut without_scale = Vec::new();
+        if elsewhere.max(joint.seen_from_elsewhere()) < MIN_FOR_SCALE {
+            without_scale = joint.away_from_main();
+            for &slot in &without_scale {
+                refuse_without_scale(&mut refined[slot]);
+            }
+        }
         let undetermined = rigid.observability.undetermined();
         let mut rigid_support = support;
         if !undetermined.is_empty() {
@@ -126,8 +166,11 @@ impl Component<'_> {
         }
         let names: Vec<&str> = self.members.iter().map(|&photo| self.photos[photo].name).collect();
         let remarks = vec![format!("the local model of {}: {}", names.join(", "), reasons.join("; "))];
-        let rigid_answers =
+        let mut rigid_answers =
             self.rigid_answers(&set_from_camera, &candidates, &rigid, rigid_support, &reasons);
+        for slot in without_scale {
+            refuse_without_scale(&mut rigid_answers[slot]);
+        }
         ComponentAnswer::Localized(Box::new(ComponentPoses {
             world_from_set: rigid.world_from_set,
             rigid: rigid_answers,

@@ -5,11 +5,11 @@ use setloc_sfm::robust::{
     GeneralizedPoseOptions, GeneralizedRay, GeneralizedSolver, RansacParams, estimate_absolute_pose,
     estimate_generalized_pose,
 };
-use setloc_sfm::{Reconstruction, Rigid, Similarity};
+use setloc_sfm::{ImageId, Reconstruction, ReconstructionPoint, Rigid, Similarity};
 
 use super::PhotoEvidence;
 use super::correspondences::{SetCorrespondence, SetRays};
-use crate::evidence::same_pose;
+use crate::evidence::{median, same_pose};
 use crate::observability::{Observability, observability, refine_similarity};
 use crate::{CamsetMethod, CamsetParams, Verdict};
 
@@ -53,7 +53,13 @@ pub(crate) fn rigid_pose(
         let view = rays.of_slot(slot);
         let sampled = view.absolute_pose(params, seed.wrapping_add(slot as u64));
         for axes_at_photo in alone.into_iter().chain(sampled) {
-            candidates.extend(view.with_local_depths(params, &axes_at_photo, correspondences, model));
+            candidates.extend(view.with_local_depths(
+                params,
+                &axes_at_photo,
+                correspondences,
+                model,
+                ImageId(photo as u32),
+            ));
             candidates.extend(rays.with_baselines(params, &axes_at_photo, &in_set.translation));
         }
     }
@@ -142,32 +148,44 @@ impl SetRays {
 
     /// The set's poses when this photo's is given: only scale is left, and each 3D-to-3D match whose ray agrees gives
     /// it as the ratio of the point's distances in scene and local model.
+    ///
+    /// Where there are none, what the photo sees of either is taken to be as far away, so that at least its own pose
+    /// is not lost.
     fn with_local_depths(
         &self,
         params: &CamsetParams,
         axes_at_photo: &Rigid,
         correspondences: &[SetCorrespondence],
         model: &Reconstruction,
+        photo: ImageId,
     ) -> Vec<Similarity> {
         let mut ratios: Vec<f64> = Vec::new();
+        let mut depths: Vec<f64> = Vec::new();
         for (ray, &correspondence) in self.rays.iter().zip(&self.correspondence) {
-            let Some(local) = correspondences[correspondence].local.and_then(|local| model.points.get(local))
-            else {
-                continue;
-            };
             let to_point =
                 axes_at_photo.rotation.inverse_transform_vector(&(ray.point - axes_at_photo.translation));
             let error = (to_point.normalize() - ray.direction).norm() / ray.sigma;
-            let ratio = to_point.norm() / (local.position - ray.origin).norm();
-            if error < params.max_error_sigmas && ratio.is_finite() && ratio > 0.0 {
-                ratios.push(ratio);
+            if !(error < params.max_error_sigmas) {
+                continue;
             }
+            depths.push(to_point.norm());
+            let local = correspondences[correspondence].local.and_then(|local| model.points.get(local));
+            let ratio = local.map(|local| to_point.norm() / (local.position - ray.origin).norm());
+            ratios.extend(ratio.filter(|ratio| ratio.is_finite() && *ratio > 0.0));
         }
+        let Some(origin) = self.rays.first().map(|ray| ray.origin) else { return Vec::new() };
         if ratios.len() < 3 {
-            return Vec::new();
+            let sees = |point: &&ReconstructionPoint| point.track.iter().any(|seen| seen.image == photo);
+            let local =
+                model.points.iter().filter(sees).map(|point| (point.position - origin).norm()).collect();
+            let scale = median(depths).zip(median(local)).map(|(scene, local)| scene / local);
+            return scale
+                .filter(|scale| scale.is_finite() && *scale > 0.0)
+                .map(|scale| scaled_about(axes_at_photo, &origin, scale))
+                .into_iter()
+                .collect();
         }
         ratios.sort_by(f64::total_cmp);
-        let origin = self.rays[0].origin;
         SCALE_QUANTILES
             .iter()
             .map(|quantile| {
