@@ -13,7 +13,8 @@ use setloc_sfm::{PointId, Rigid};
 
 use crate::evidence::{PhotoRays, SceneMatch};
 
-/// Scale of the robust loss in standard deviations: inliers (up to four) hardly feel it, leftovers do.
+/// Scale of the robust loss in standard deviations: at one deviation an observation has half its weight, at four (an
+/// inlier still) a seventeenth, so leftovers among the matches hardly pull.
 const LOSS_SCALE: f64 = 1.0;
 /// Observations that a photo needs before its intrinsics are estimated.
 const MIN_FOR_INTRINSICS: usize = 30;
