@@ -94,6 +94,18 @@ pub struct PairGeometry {
     pub two_view: TwoView,
 }
 
+impl PairGeometry {
+    /// The other image and `image_from_other`, its translation of unit length; `None` for an image not of the pair.
+    pub fn seen_from(&self, image: ImageId) -> Option<(ImageId, Rigid)> {
+        let second_from_first = self.two_view.second_from_first;
+        match image {
+            _ if image == self.second => Some((self.first, second_from_first)),
+            _ if image == self.first => Some((self.second, second_from_first.inverse())),
+            _ => None,
+        }
+    }
+}
+
 /// Verifies putative matches by essential matrices on rays; empty when too few agree.
 ///
 /// Where façades repeat, the wrong alignment of two neighbours can have more matches than the right one. So a second

@@ -3,7 +3,7 @@ use setloc_features::{GuidedParams, match_guided};
 
 use super::{correspondence::CorrespondenceGraph, direction, model::Model, standpoint::in_view};
 use crate::{
-    ImageId, Observation, PairGeometry, PointId, Rigid, TwoViewKind,
+    ImageId, Observation, PointId, Rigid, TwoViewKind,
     robust::{RansacParams, estimate_absolute_pose, refine_absolute_pose},
     solvers::essential::essential_from_pose,
     visibility::is_same_view,
@@ -152,12 +152,7 @@ pub(super) fn hypothesize_from_pairs(
     };
     let mut hypotheses = Vec::new();
     for pair in model.input.pairs {
-        let image_from_other = match image {
-            _ if image == pair.second => pair.two_view.second_from_first,
-            _ if image == pair.first => pair.two_view.second_from_first.inverse(),
-            _ => continue,
-        };
-        let other = if image == pair.first { pair.second } else { pair.first };
+        let Some((other, image_from_other)) = pair.seen_from(image) else { continue };
         let Some(pose) = &model.poses[other.index()] else { continue };
         if pair.two_view.kind == TwoViewKind::PureRotation {
             continue;
@@ -208,18 +203,16 @@ const BASELINE_LEAD: f64 = 2.5;
 /// Lengths by less than this factor apart are one.
 const SAME_LENGTH: f64 = 1.25;
 
-/// The pose of `image` from its verified pair with the registered image `other`, the length of the baseline from
+/// The pose of `image` from its verified geometry with the registered image `other`, the length of the baseline from
 /// matches along the pair's epipolar circles; `None` unless one length stands out.
 pub(super) fn hypothesize_baseline(
     model: &Model<'_>,
-    pair: &PairGeometry,
     image: ImageId,
     other: ImageId,
+    image_from_other: &Rigid,
     params: &RansacParams,
 ) -> Option<PoseHypothesis> {
     let pose = model.poses[other.index()].as_ref()?;
-    let second_from_first = pair.two_view.second_from_first;
-    let image_from_other = if image == pair.second { second_from_first } else { second_from_first.inverse() };
     let world_from_image = pose.world_from_camera * image_from_other.inverse();
     let step = world_from_image.translation - pose.center();
     let features = |image: ImageId| (model.input.images[image.index()].features, &model.rays[image.index()]);
@@ -227,7 +220,7 @@ pub(super) fn hypothesize_baseline(
         &GuidedParams::default(),
         features(other),
         features(image),
-        &essential_from_pose(&image_from_other),
+        &essential_from_pose(image_from_other),
     );
     let rays = &model.rays[image.index()];
     let mut candidates: Vec<(u32, PointId, Vector3<f64>)> = Vec::new();
