@@ -5,7 +5,7 @@ use super::{correspondence::CorrespondenceGraph, direction, model::Model, standp
 use crate::{
     ImageId, Observation, PointId, Rigid, TwoViewKind,
     robust::{RansacParams, estimate_absolute_pose, refine_absolute_pose},
-    solvers::essential::essential_from_pose,
+    solvers::{essential::essential_from_pose, triangulation::length_along},
     visibility::is_same_view,
 };
 
@@ -159,13 +159,11 @@ pub(super) fn hypothesize_from_pairs(
         }
         let world_from_image = pose.world_from_camera * image_from_other.inverse();
         let step = world_from_image.translation - pose.center();
-        // The centre lies at other + s·step; each point asks for the s that puts it on its ray: (X − C)×r = s·(step×r).
+        // The centre lies at other + s·step; each point asks for the s that puts it on its ray.
         let mut lengths: Vec<f64> = (0..points.len())
             .filter_map(|index| {
                 let ray = world_from_image.rotation * bearings[index];
-                let (wanted, lever) = ((points[index] - pose.center()).cross(&ray), step.cross(&ray));
-                let length = wanted.dot(&lever) / lever.norm_squared();
-                (length.is_finite() && length > 0.0).then_some(length)
+                length_along(&step, &(points[index] - pose.center()), &ray)
             })
             .collect();
         if lengths.len() < params.min_inliers {
@@ -229,9 +227,9 @@ pub(super) fn hypothesize_baseline(
         let Some(id) = model.point_of(Observation { image: other, feature: m.first }) else { continue };
         let Some(point) = model.point(id) else { continue };
         let ray = world_from_image.rotation * rays.bearings[m.second as usize];
-        let (wanted, lever) = ((point.position - pose.center()).cross(&ray), step.cross(&ray));
-        let length = wanted.dot(&lever) / lever.norm_squared();
-        if length.is_finite() && length > 0.0 && rays.sigmas[m.second as usize].is_finite() {
+        if let Some(length) = length_along(&step, &(point.position - pose.center()), &ray)
+            && rays.sigmas[m.second as usize].is_finite()
+        {
             candidates.push((m.second, id, point.position));
             lengths.push(length);
         }
