@@ -43,13 +43,7 @@ impl Mosaic {
 
 /// Whether a direction of the camera's frame falls into its image.
 pub(super) fn in_view(camera: &Camera, direction: &Vector3<f64>) -> bool {
-    camera.is_panoramic()
-        || camera.project(direction).is_some_and(|pixel| {
-            pixel.x >= 0.0
-                && pixel.y >= 0.0
-                && pixel.x < f64::from(camera.width)
-                && pixel.y < f64::from(camera.height)
-        })
+    camera.is_panoramic() || camera.project(direction).is_some_and(|pixel| camera.contains(&pixel))
 }
 
 /// The input with mosaics in place of photos from one standpoint.
