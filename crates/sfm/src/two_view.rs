@@ -76,8 +76,7 @@ impl TwoView {
     /// The same geometry with the two images exchanged.
     #[must_use]
     pub fn flipped(&self) -> Self {
-        let mut inliers: Vec<Match> =
-            self.inliers.iter().map(|m| Match { first: m.second, second: m.first }).collect();
+        let mut inliers: Vec<Match> = self.inliers.iter().map(|m| m.swapped()).collect();
         inliers.sort_unstable();
         Self { second_from_first: self.second_from_first.inverse(), inliers, ..self.clone() }
     }

@@ -35,6 +35,14 @@ pub struct Match {
     pub second: u32,
 }
 
+impl Match {
+    /// The same match with the two images exchanged.
+    #[must_use]
+    pub fn swapped(self) -> Self {
+        Self { first: self.second, second: self.first }
+    }
+}
+
 /// How to match two images.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

@@ -201,9 +201,11 @@ impl<'a> Standpoints<'a> {
                 return;
             }
             let moved = found.iter().filter_map(|m| {
-                let x = *place[first.index()].get(m.first as usize)?;
-                let y = *place[second.index()].get(m.second as usize)?;
-                Some(if a < b { Match { first: x, second: y } } else { Match { first: y, second: x } })
+                let moved = Match {
+                    first: *place[first.index()].get(m.first as usize)?,
+                    second: *place[second.index()].get(m.second as usize)?,
+                };
+                Some(if a < b { moved } else { moved.swapped() })
             });
             matches.entry((a.min(b), a.max(b))).or_default().extend(moved);
         };
