@@ -142,6 +142,7 @@ pub fn match_features(params: &MatchParams, first: &ImageFeatures, second: &Imag
     match_simulated(first, second, own, |a, b| match_all(params, (first, a), (second, b)))
 }
 
+/// Bright and dark keypoints to match.
 type Parts = [Range<usize>; 2];
 
 /// Adds the matches of simulated views, each with the other image itself, to the images' own.
@@ -197,8 +198,8 @@ fn distinct(first: &ImageFeatures, second: &ImageFeatures, found: impl Iterator<
 /// Matches some bright and some dark keypoints of two images.
 fn match_all(
     params: &MatchParams,
-    (first, first_parts): (&ImageFeatures, [Range<usize>; 2]),
-    (second, second_parts): (&ImageFeatures, [Range<usize>; 2]),
+    (first, first_parts): (&ImageFeatures, Parts),
+    (second, second_parts): (&ImageFeatures, Parts),
 ) -> Vec<Match> {
     // A spot brighter than its surround never shows what a darker one does, so half the products suffice.
     let mut matches = Vec::new();
