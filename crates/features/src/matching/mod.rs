@@ -1,7 +1,11 @@
+#[cfg(target_arch = "x86_64")]
 mod avx2;
+#[cfg(target_arch = "x86_64")]
 mod avx512;
 mod guided;
 mod kernel;
+#[cfg(target_arch = "x86_64")]
+mod tiles;
 
 use std::collections::BTreeMap;
 use std::ops::Range;
