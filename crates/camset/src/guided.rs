@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
-use setloc_index::{NearestPoints, SceneIndex, squared_distance};
+use setloc_features::squared_distance;
+use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::{PointId, Rigid};
 
 use crate::GuidedParams;

@@ -61,5 +61,6 @@ pub use features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Keypoint, Ray
 pub use geodesy::Wgs84;
 pub use mask::Mask;
 pub use matching::{
-    DescriptorBlock, GuidedParams, Match, MatchParams, TwoNearest, match_features, match_guided, two_nearest,
+    DescriptorBlock, GuidedParams, Match, MatchParams, TwoNearest, match_features, match_guided,
+    squared_distance, two_nearest,
 };

@@ -280,9 +280,11 @@ pub(super) fn squared_norm(descriptor: &[u8]) -> i32 {
     descriptor.iter().map(|&value| i32::from(value) * i32::from(value)).sum()
 }
 
-/// Squared distance of two descriptors.
-#[inline(always)]
-pub(super) fn distance2(first: &[u8], second: &[u8]) -> u32 {
+/// Squared Euclidean distance of two descriptors.
+///
+/// At most 128 · 255² < 2²³, so it is exact.
+#[inline]
+pub fn squared_distance(first: &[u8], second: &[u8]) -> u32 {
     first.iter().zip(second).map(|(&a, &b)| (i32::from(a) - i32::from(b)).pow(2)).sum::<i32>() as u32
 }
 
@@ -330,7 +332,7 @@ mod tests {
             .map(|query| {
                 let mut nearest = TwoNearest::NONE;
                 for (index, candidate) in base.chunks_exact(DESCRIPTOR_LEN).enumerate() {
-                    nearest.offer(index as u32, distance2(query, candidate));
+                    nearest.offer(index as u32, squared_distance(query, candidate));
                 }
                 nearest
             })

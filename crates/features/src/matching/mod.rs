@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, FeatureError, ImageFeatures, Keypoint};
 pub use guided::{GuidedParams, match_guided};
-pub use kernel::{DescriptorBlock, TwoNearest, two_nearest};
+pub use kernel::{DescriptorBlock, TwoNearest, squared_distance, two_nearest};
 
 /// A putative or verified match: keypoint `first` of one image shows what keypoint `second` of another shows.
 #[derive(
@@ -161,7 +161,7 @@ fn match_simulated(
     simulated.extend(second.simulated_parts().flat_map(|b| of_views(first.parts(), b)));
     simulated.sort_by_cached_key(|m| {
         let (a, b) = (first.descriptor(m.first as usize), second.descriptor(m.second as usize));
-        (kernel::distance2(a, b), *m)
+        (squared_distance(a, b), *m)
     });
     let mut matches = distinct(first, second, own.into_iter().chain(simulated));
     matches.sort_unstable();
