@@ -28,7 +28,7 @@ impl Avx2 {
         std::arch::is_x86_feature_detected!("avx2").then_some(Self(()))
     }
 
-    pub fn pack_base(self, descriptors: &[u8]) -> PackedBase {
+    pub fn pack_base(descriptors: &[u8]) -> PackedBase {
         let padded = super::count(descriptors).next_multiple_of(LANES * VECTORS);
         let mut lines: Vec<Line> = vec![bytemuck::Zeroable::zeroed(); padded / LANES * Self::BASE_LINES];
         let words: &mut [i16] = bytemuck::cast_slice_mut(&mut lines);
@@ -45,7 +45,7 @@ impl Avx2 {
         PackedBase { lines, terms }
     }
 
-    pub fn pack_queries(self, descriptors: &[u8]) -> PackedQueries {
+    pub fn pack_queries(descriptors: &[u8]) -> PackedQueries {
         PackedQueries::new(descriptors, ROWS, i16::from)
     }
 

@@ -30,7 +30,7 @@ impl Avx512 {
         is_available.then_some(Self(()))
     }
 
-    pub fn pack_base(self, descriptors: &[u8]) -> PackedBase {
+    pub fn pack_base(descriptors: &[u8]) -> PackedBase {
         let padded = super::count(descriptors).next_multiple_of(LANES * VECTORS);
         let mut lines: Vec<Line> = vec![bytemuck::Zeroable::zeroed(); padded / LANES * Self::BASE_LINES];
         let mut terms = vec![super::kernel::PADDING; padded];
@@ -45,7 +45,7 @@ impl Avx512 {
         PackedBase { lines, terms }
     }
 
-    pub fn pack_queries(self, descriptors: &[u8]) -> PackedQueries {
+    pub fn pack_queries(descriptors: &[u8]) -> PackedQueries {
         PackedQueries::new(descriptors, ROWS, |value| value ^ 0x80)
     }
 

@@ -84,9 +84,9 @@ impl Kernel {
         match self {
             Self::Scalar => PackedBase { lines: lines_of(descriptors), terms: terms_of(descriptors) },
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2(kernel) => kernel.pack_base(descriptors),
+            Self::Avx2(_) => Avx2::pack_base(descriptors),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512(kernel) => kernel.pack_base(descriptors),
+            Self::Avx512(_) => Avx512::pack_base(descriptors),
         }
     }
 
@@ -94,9 +94,9 @@ impl Kernel {
         match self {
             Self::Scalar => PackedQueries::new(descriptors, 1, |value| value),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2(kernel) => kernel.pack_queries(descriptors),
+            Self::Avx2(_) => Avx2::pack_queries(descriptors),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512(kernel) => kernel.pack_queries(descriptors),
+            Self::Avx512(_) => Avx512::pack_queries(descriptors),
         }
     }
 
