@@ -3,9 +3,8 @@
 use std::collections::BTreeMap;
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
-use nalgebra::Vector2;
-use setloc_features::Camera;
-use setloc_index::{NearestPoints, SceneIndex, squared_distance};
+use setloc_features::squared_distance;
+use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::{PointId, Rigid};
 
 use crate::GuidedParams;
@@ -39,7 +38,7 @@ pub(crate) fn guided_matches(
         let distance = offset.norm();
         let direction_in_camera = world_from_camera.rotation.inverse_transform_vector(&offset);
         let Some(pixel) =
-            photo.camera.project(&direction_in_camera).filter(|pixel| inside(photo.camera, pixel))
+            photo.camera.project(&direction_in_camera).filter(|pixel| photo.camera.contains(pixel))
         else {
             continue;
         };
@@ -98,11 +97,4 @@ pub(crate) fn guided_matches(
         }
     }
     chosen.into_iter().map(|(feature, (_, point))| SceneMatch { feature, point }).collect()
-}
-
-fn inside(camera: &Camera, pixel: &Vector2<f64>) -> bool {
-    pixel.x >= 0.0
-        && pixel.y >= 0.0
-        && pixel.x < f64::from(camera.width)
-        && pixel.y < f64::from(camera.height)
 }

@@ -13,7 +13,8 @@ use setloc_sfm::{PointId, Rigid};
 
 use crate::evidence::{PhotoRays, SceneMatch};
 
-/// Scale of the robust loss in standard deviations: inliers (up to four) hardly feel it, leftovers do.
+/// Scale of the robust loss in standard deviations: at one deviation an observation has half its weight, at four (an
+/// inlier still) a seventeenth, so leftovers among the matches hardly pull.
 const LOSS_SCALE: f64 = 1.0;
 /// Observations that a photo needs before its intrinsics are estimated.
 const MIN_FOR_INTRINSICS: usize = 30;
@@ -72,7 +73,9 @@ pub(crate) fn refine_jointly(
         let photo = &model.photos[slot];
         for &found in matches {
             let point = *scene_points.entry(found.point).or_insert_with(|| {
-                points.push(BundlePoint { position: index.position(found.point), fixed: false });
+                // An exact point has no bearings that hold it.
+                let fixed = index.position_covariance(found.point) == Matrix3::zeros();
+                points.push(BundlePoint { position: index.position(found.point), fixed });
                 points.len() as u32 - 1
             });
             observations.extend(standpoints.observation(rays, slot, found.feature, point));
@@ -227,7 +230,8 @@ struct PriorBearing {
 /// by percents, the same way for a whole façade. Taken as fixed they bend the scale of the set to themselves, and the
 /// covariance does not show it. A bearing from far along axis k with weight w_k tells the place across that axis only;
 /// three of them sum up to the information Σ⁻¹ when w_k = (Σ_j i_j)/2 − i_k for the information i_j along axis j. An
-/// axis that is known better than the other two together counts as they do, since no weight is negative.
+/// axis that is known better than the other two together counts as they do, since no weight is negative. A covariance
+/// of zero (an exact point) or without bound has no bearings.
 fn prior_bearings(position: &Vector3<f64>, covariance: &Matrix3<f64>) -> Vec<PriorBearing> {
     let eigen = covariance.symmetric_eigen();
     let largest = eigen.eigenvalues.max();
@@ -264,7 +268,7 @@ fn covariances(problem: &BundleProblem, photos: usize, loss: RobustLoss) -> Vec<
         }
         return found;
     }
-    let mut of_scene = vec![false; problem.points.len()];
+    let mut of_scene: Vec<bool> = problem.points.iter().map(|point| point.fixed).collect();
     for prior in problem.observations.iter().filter(|o| o.pose as usize >= photos) {
         of_scene[prior.point as usize] = true;
     }
@@ -286,6 +290,29 @@ fn covariances(problem: &BundleProblem, photos: usize, loss: RobustLoss) -> Vec<
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::test_scene::World;
+
+    #[test]
+    fn exact_scene_points_hold_a_photo_and_tell_its_covariance() {
+        let mut world = World::chain(1, 0.0, 31);
+        world.make_scene_exact();
+        let (view, matches) = (&world.photos[0], world.scene_matches(0));
+        assert!(matches.len() > 100);
+        let mut off = view.pose;
+        off.translation += Vector3::new(0.3, -0.1, 0.2);
+        let mut model = JointModel {
+            cameras: vec![world.camera.clone()],
+            camera_fixed: vec![true],
+            photos: vec![JointPhoto { camera: 0, world_from_camera: off, standpoint: 0 }],
+            points: Vec::new(),
+        };
+        let rays = [PhotoRays::new(&view.features, &world.camera)];
+        let covariances = refine_jointly(&mut model, &world.index, &rays, &[matches], &[], true);
+        let (center, rotation) = world.errors(0, &model.photos[0].world_from_camera);
+        assert!(center < 0.03 && rotation < 0.1, "{center} {rotation}");
+        let covariance = covariances[0].expect("fixed points leave nothing undetermined");
+        assert!(covariance.trace() > 0.0 && covariance.trace() < 1e-3, "{covariance}");
+    }
 
     #[test]
     fn the_covariance_of_a_turned_camera_is_that_of_its_own_axes() {

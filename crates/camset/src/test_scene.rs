@@ -11,6 +11,7 @@ use setloc_sfm::{
     Similarity,
 };
 
+use crate::evidence::SceneMatch;
 use crate::{QueryPhoto, Scene};
 
 const NOISE_PX: f64 = 0.5;
@@ -234,6 +235,26 @@ impl World {
         }
         let features: Vec<&ImageFeatures> = self.panoramas.iter().map(|view| &view.features).collect();
         self.index = SceneIndex::build(&IndexParams::default(), &self.scene_model, &features);
+    }
+
+    /// Makes the scene's points exact: without noise in the panoramas, the index gives them no covariance.
+    pub(crate) fn make_scene_exact(&mut self) {
+        for keypoint in self.panoramas.iter_mut().flat_map(|view| &mut view.features.keypoints) {
+            keypoint.noise_px = 0.0;
+        }
+        let features: Vec<&ImageFeatures> = self.panoramas.iter().map(|view| &view.features).collect();
+        self.index = SceneIndex::build(&IndexParams::default(), &self.scene_model, &features);
+    }
+
+    /// The true matches of a photo to the scene.
+    pub(crate) fn scene_matches(&self, photo: usize) -> Vec<SceneMatch> {
+        let scene_point = |shown: &Option<usize>| self.scene_points.binary_search(shown.as_ref()?).ok();
+        (0..)
+            .zip(&self.photos[photo].shows)
+            .filter_map(|(feature, shown)| {
+                Some(SceneMatch { feature, point: PointId(scene_point(shown)? as u32) })
+            })
+            .collect()
     }
 
     pub(crate) fn scene(&self) -> Scene<'_> {

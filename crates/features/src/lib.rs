@@ -45,6 +45,7 @@ mod decode;
 mod error;
 mod extract;
 mod features;
+mod geodesy;
 mod mask;
 mod matching;
 mod sift;
@@ -57,7 +58,9 @@ pub use decode::{
 pub use error::FeatureError;
 pub use extract::{FeatureParams, extract, keypoint_noise_px};
 pub use features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Keypoint, Rays, SimulatedView};
+pub use geodesy::Wgs84;
 pub use mask::Mask;
 pub use matching::{
-    DescriptorBlock, GuidedParams, Match, MatchParams, TwoNearest, match_features, match_guided, two_nearest,
+    DescriptorBlock, GuidedParams, Match, MatchParams, TwoNearest, match_features, match_guided,
+    squared_distance, two_nearest,
 };

@@ -1,13 +1,9 @@
 use setloc_features::DESCRIPTOR_LEN;
 
-/// Squared Euclidean distance of two descriptors.
-///
-/// At most 128 · 255² < 2²⁴, so it is exact in `u32`.
-pub fn squared_distance(a: &[u8], b: &[u8]) -> u32 {
-    a.iter().zip(b).map(|(&a, &b)| u32::from(a.abs_diff(b)).pow(2)).sum()
-}
-
 /// Squared distances of one descriptor to all rows of `base`, appended nowhere: `out[i]` belongs to row `i`.
+///
+/// Unlike a [`DescriptorBlock`](setloc_features::DescriptorBlock), which knows the best two rows only, it tells what the
+/// two nearest *points* of several rows each are made of.
 ///
 /// `base` has `out.len()` rows of [`DESCRIPTOR_LEN`] bytes; further rows are ignored.
 pub fn squared_distances(query: &[u8], base: &[u8], out: &mut [u32]) {
@@ -49,6 +45,7 @@ mod tests {
     use super::*;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
+    use setloc_features::squared_distance;
 
     #[test]
     fn every_path_agrees_with_the_definition() {

@@ -15,7 +15,7 @@ mod params;
 mod scene_index;
 mod search;
 
-pub use kernel::{squared_distance, squared_distances};
+pub use kernel::squared_distances;
 pub use matching::{Correspondence, LocalDescriptors, PointCorrespondence};
 pub use nearest::{NearestPoints, Neighbour};
 pub use params::{Backend, IndexParams};

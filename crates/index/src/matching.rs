@@ -163,13 +163,13 @@ mod tests {
     use nalgebra::Vector3;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
-    use setloc_features::{Camera, DESCRIPTOR_LEN, Keypoint};
+    use setloc_features::{Camera, DESCRIPTOR_LEN, Keypoint, squared_distance};
     use setloc_sfm::{
         CameraId, ImageId, Observation, Reconstruction, ReconstructionImage, ReconstructionPoint, Rigid,
     };
 
     use super::*;
-    use crate::{Backend, IndexParams, Neighbour, squared_distance};
+    use crate::{Backend, IndexParams, Neighbour};
 
     /// Descriptors in clusters, as real ones are, with `noise` between observations of one point.
     fn descriptor(rng: &mut ChaCha8Rng, center: &[u8], noise: i16) -> Vec<u8> {

@@ -4,11 +4,11 @@ use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use setloc_features::{DESCRIPTOR_LEN, ImageFeatures};
+use setloc_features::{DESCRIPTOR_LEN, ImageFeatures, squared_distance};
 use setloc_sfm::{ImageId, PointId, Reconstruction};
 
 use crate::search::{InvertedLists, PrincipalTree, Search, nearest_exact, scan_rows};
-use crate::{Backend, IndexParams, NearestPoints, squared_distance};
+use crate::{Backend, IndexParams, NearestPoints};
 
 /// Queries that share one pass over the rows.
 const TILE_QUERIES: usize = 64;

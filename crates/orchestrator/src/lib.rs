@@ -17,7 +17,6 @@ pub mod digest;
 pub mod error;
 pub mod export;
 pub mod fingerprint;
-pub mod geodesy;
 pub mod graph;
 pub mod html;
 pub mod import;

@@ -4,13 +4,13 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
+use setloc_features::Wgs84;
 use setloc_index::SceneIndex;
 use setloc_sfm::Reconstruction;
 
 use crate::codec;
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
-use crate::geodesy::Wgs84;
 use crate::serde_artifact;
 
 /// A built scene.

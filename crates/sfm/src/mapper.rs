@@ -356,16 +356,14 @@ impl<'a> Mapper<'a> {
             if pair.two_view.kind != TwoViewKind::PureRotation || matches < self.params.min_turn_matches {
                 continue;
             }
-            let turn = pair.two_view.second_from_first.rotation;
-            for (image, anchor, image_from_anchor) in
-                [(pair.second, pair.first, turn), (pair.first, pair.second, turn.inverse())]
-            {
+            for image in [pair.second, pair.first] {
+                let Some((anchor, image_from_anchor)) = pair.seen_from(image) else { continue };
                 let open = !self.model.is_registered(image)
                     && !self.taken[image.index()]
                     && self.anchors[image.index()].is_none()
                     && self.model.is_registered(anchor);
                 if open && best.is_none_or(|(most, ..)| matches > most) {
-                    best = Some((matches, image, anchor, image_from_anchor));
+                    best = Some((matches, image, anchor, image_from_anchor.rotation));
                 }
             }
         }
@@ -384,13 +382,11 @@ impl<'a> Mapper<'a> {
     fn register_by_baseline(&mut self) -> Option<ImageId> {
         let mut best: Option<(usize, ImageId, PoseHypothesis)> = None;
         for (index, pair) in self.model.input.pairs.iter().enumerate() {
-            let (first, second) = (pair.first, pair.second);
-            let (image, other) = match (self.model.is_registered(first), self.model.is_registered(second)) {
-                (true, false) => (second, first),
-                (false, true) => (first, second),
-                _ => continue,
-            };
-            if self.taken[image.index()]
+            let image = if self.model.is_registered(pair.first) { pair.second } else { pair.first };
+            let Some((other, image_from_other)) = pair.seen_from(image) else { continue };
+            if self.model.is_registered(image)
+                || !self.model.is_registered(other)
+                || self.taken[image.index()]
                 || pair.two_view.kind == TwoViewKind::PureRotation
                 || pair.two_view.inliers.len() < self.params.min_initial_points
             {
@@ -402,7 +398,9 @@ impl<'a> Mapper<'a> {
                 continue;
             }
             self.baseline_tried.insert(index, points);
-            if let Some(pose) = hypothesize_baseline(&self.model, pair, image, other, &self.params.ransac())
+            let hypothesis =
+                hypothesize_baseline(&self.model, image, other, &image_from_other, &self.params.ransac());
+            if let Some(pose) = hypothesis
                 && best.as_ref().is_none_or(|(most, ..)| pose.inliers.len() > *most)
             {
                 best = Some((pose.inliers.len(), image, pose));
@@ -519,17 +517,12 @@ impl<'a> Mapper<'a> {
     fn pair_agreement(&self, image: ImageId, world_from_camera: &Rigid) -> f64 {
         let (mut agreeing, mut all) = (0, 0);
         for pair in self.model.input.pairs {
-            let other = match image {
-                _ if image == pair.first => pair.second,
-                _ if image == pair.second => pair.first,
-                _ => continue,
-            };
+            let Some((other, measured)) = pair.seen_from(image) else { continue };
             let Some(pose) = &self.model.poses[other.index()] else { continue };
-            let other_from_image = pose.world_from_camera.rotation.inverse() * world_from_camera.rotation;
-            let measured = pair.two_view.second_from_first.rotation;
-            let measured = if image == pair.first { measured } else { measured.inverse() };
+            let image_from_other = world_from_camera.rotation.inverse() * pose.world_from_camera.rotation;
             all += pair.two_view.inliers.len();
-            if other_from_image.angle_to(&measured).to_degrees() <= self.params.max_pair_rotation_deg {
+            let deviation = image_from_other.angle_to(&measured.rotation);
+            if deviation.to_degrees() <= self.params.max_pair_rotation_deg {
                 agreeing += pair.two_view.inliers.len();
             }
         }

@@ -33,6 +33,12 @@ pub use ugp3ps::ugp3ps;
 
 use nalgebra::Vector3;
 
+/// The largest distance of the others from the first: the unit of length in which a solver works.
+#[inline]
+fn reach(points: &[Vector3<f64>]) -> f64 {
+    points[1..].iter().map(|point| (point - points[0]).norm()).fold(0.0, f64::max)
+}
+
 /// Two unit vectors that complete a unit vector to an orthonormal basis.
 ///
 /// T. Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 2017: no branch, no singular direction.

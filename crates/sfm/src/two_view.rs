@@ -76,8 +76,7 @@ impl TwoView {
     /// The same geometry with the two images exchanged.
     #[must_use]
     pub fn flipped(&self) -> Self {
-        let mut inliers: Vec<Match> =
-            self.inliers.iter().map(|m| Match { first: m.second, second: m.first }).collect();
+        let mut inliers: Vec<Match> = self.inliers.iter().map(|m| m.swapped()).collect();
         inliers.sort_unstable();
         Self { second_from_first: self.second_from_first.inverse(), inliers, ..self.clone() }
     }
@@ -92,6 +91,18 @@ pub struct PairGeometry {
     pub second: ImageId,
     /// Its geometry.
     pub two_view: TwoView,
+}
+
+impl PairGeometry {
+    /// The other image and `image_from_other`, its translation of unit length; `None` for an image not of the pair.
+    pub fn seen_from(&self, image: ImageId) -> Option<(ImageId, Rigid)> {
+        let second_from_first = self.two_view.second_from_first;
+        match image {
+            _ if image == self.second => Some((self.first, second_from_first)),
+            _ if image == self.first => Some((self.second, second_from_first.inverse())),
+            _ => None,
+        }
+    }
 }
 
 /// Verifies putative matches by essential matrices on rays; empty when too few agree.

@@ -8,9 +8,9 @@ use nalgebra::Vector3;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::{Map, Value, json};
+use setloc_features::Wgs84;
 
 use crate::error::TownError;
-use crate::geodesy::GeoOrigin;
 use crate::params::TownParams;
 use crate::render::RenderedView;
 use crate::town::Town;
@@ -19,7 +19,7 @@ use crate::town::Town;
 pub const PHOTO_SET: &str = "lane";
 
 /// Where the town's frame is anchored.
-const ORIGIN: GeoOrigin = GeoOrigin { lat: 47.3769, lon: 8.5417, alt: 408.0 };
+const ORIGIN: Wgs84 = Wgs84 { lat: 47.3769, lon: 8.5417, alt: 408.0 };
 
 /// Renders a town and writes it as a data set: `panoramas/`, `queries/`, `cameras.json`, `truth.json`, `geo.csv`.
 ///
@@ -102,7 +102,7 @@ fn positions(town: &Town) -> String {
     let mut table = String::from("name,lat,lon,alt\n");
     for view in town.views().iter().filter(|view| view.camera.is_panoramic()) {
         let noise = Vector3::from_fn(|_, _| gaussian(&mut rng)) * town.params.gps_noise_m;
-        let place = ORIGIN.geodetic_from_enu(&(view.center_in_world + noise));
+        let place = Wgs84::from_enu(&(view.center_in_world + noise), ORIGIN);
         // Writing to a String cannot fail.
         let _ = writeln!(table, "{},{:.8},{:.8},{:.3}", view.name, place.lat, place.lon, place.alt);
     }

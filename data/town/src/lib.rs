@@ -16,7 +16,6 @@ mod bvh;
 mod dataset;
 mod error;
 mod facade;
-mod geodesy;
 mod geometry;
 mod layout;
 mod light;
@@ -28,7 +27,6 @@ mod town;
 
 pub use dataset::{PHOTO_SET, write_dataset};
 pub use error::TownError;
-pub use geodesy::GeoOrigin;
 pub use params::{TownParams, VERSION};
 pub use render::RenderedView;
 pub use town::{Town, View};

@@ -5,6 +5,7 @@ use setloc_sfm::robust::{
     GeneralizedPoseOptions, GeneralizedRay, GeneralizedSolver, RansacParams, estimate_absolute_pose,
     estimate_generalized_pose,
 };
+use setloc_sfm::solvers::triangulation::length_along;
 use setloc_sfm::{ImageId, Reconstruction, ReconstructionPoint, Rigid, Similarity};
 
 use super::PhotoEvidence;
@@ -211,14 +212,9 @@ impl SetRays {
             .filter_map(|ray| {
                 let step = axes_at_photo.rotation * (ray.origin - origin);
                 let direction = axes_at_photo.rotation * ray.direction;
-                let (wanted, lever) =
-                    ((ray.point - axes_at_photo.translation).cross(&direction), step.cross(&direction));
-                let scale = wanted.dot(&lever) / lever.norm_squared();
+                let scale = length_along(&step, &(ray.point - axes_at_photo.translation), &direction)?;
                 let pose = scaled_about(axes_at_photo, origin, scale);
-                let meets = scale > 0.0
-                    && scale.is_finite()
-                    && ray.error_sigmas(&pose.inverse()) < params.max_error_sigmas;
-                meets.then_some(scale)
+                (ray.error_sigmas(&pose.inverse()) < params.max_error_sigmas).then_some(scale)
             })
             .collect();
         scales.sort_by(f64::total_cmp);

@@ -177,6 +177,14 @@ impl Camera {
         self.unproject_with_jacobian(pixel).map(|ray| (ray.d_pixel.norm_squared() / 2.0).sqrt())
     }
 
+    /// Whether a pixel lies in the image.
+    pub fn contains(&self, pixel: &Vector2<f64>) -> bool {
+        pixel.x >= 0.0
+            && pixel.y >= 0.0
+            && pixel.x < f64::from(self.width)
+            && pixel.y < f64::from(self.height)
+    }
+
     /// Whether the camera sees the whole sphere (or is a crop of a picture that does).
     pub fn is_panoramic(&self) -> bool {
         self.model == CameraModel::Equirectangular

@@ -4,7 +4,7 @@ use std::ops::Range;
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::kernel::{TwoNearest, distance2};
+use super::kernel::{TwoNearest, squared_distance};
 use super::{Match, Parts, collect, match_simulated, passes};
 use crate::{DESCRIPTOR_LEN, ImageFeatures, Rays};
 
@@ -94,7 +94,7 @@ fn match_parts_guided(
             if bearing.dot(&plane).abs() > max_sine || *bearing == Vector3::zeros() {
                 continue;
             }
-            let distance2 = distance2(descriptor, second.0.descriptor(b.start + candidate as usize));
+            let distance2 = squared_distance(descriptor, second.0.descriptor(b.start + candidate as usize));
             forward[index].offer(candidate, distance2);
             backward[candidate as usize].offer(index as u32, distance2);
         }

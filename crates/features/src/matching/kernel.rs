@@ -8,7 +8,9 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use super::{avx2, avx512, count};
+use super::count;
+#[cfg(target_arch = "x86_64")]
+use super::{avx2::Avx2, avx512::Avx512};
 use crate::DESCRIPTOR_LEN;
 
 /// Distance of a slot that has seen nothing: above every real squared distance (128 · 255² < 2²³).
@@ -63,18 +65,55 @@ impl TwoNearest {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kernel {
     Scalar,
-    Avx2,
-    Avx512,
+    #[cfg(target_arch = "x86_64")]
+    Avx2(Avx2),
+    #[cfg(target_arch = "x86_64")]
+    Avx512(Avx512),
 }
 
 impl Kernel {
     pub fn detect() -> Self {
-        if avx512::is_available() {
-            Self::Avx512
-        } else if avx2::is_available() {
-            Self::Avx2
-        } else {
-            Self::Scalar
+        #[cfg(target_arch = "x86_64")]
+        if let Some(kernel) = Avx512::detect().map(Self::Avx512).or_else(|| Avx2::detect().map(Self::Avx2)) {
+            return kernel;
+        }
+        Self::Scalar
+    }
+
+    fn pack_base(self, descriptors: &[u8]) -> PackedBase {
+        match self {
+            Self::Scalar => PackedBase { lines: lines_of(descriptors), terms: terms_of(descriptors) },
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(_) => Avx2::pack_base(descriptors),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(_) => Avx512::pack_base(descriptors),
+        }
+    }
+
+    fn pack_queries(self, descriptors: &[u8]) -> PackedQueries {
+        match self {
+            Self::Scalar => PackedQueries::new(descriptors, 1, |value| value),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(_) => Avx2::pack_queries(descriptors),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(_) => Avx512::pack_queries(descriptors),
+        }
+    }
+
+    fn search(
+        self,
+        queries: &PackedQueries,
+        base: &PackedBase,
+        rows: &mut Slots,
+        columns: &mut Slots,
+        both: bool,
+    ) {
+        match self {
+            Self::Scalar => search_scalar(queries, base, rows, columns),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(kernel) => kernel.search(queries, base, rows, columns, both),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(kernel) => kernel.search(queries, base, rows, columns, both),
         }
     }
 }
@@ -96,6 +135,22 @@ pub(super) struct PackedQueries {
     pub lines: Vec<Line>,
     /// What each row adds to the squared distance, padded to whole tiles.
     pub terms: Vec<i32>,
+}
+
+impl PackedQueries {
+    /// Row-major queries, each byte as `stored`, padded to whole tiles of `tile_rows`.
+    pub fn new<T: Pod>(descriptors: &[u8], tile_rows: usize, stored: impl Fn(u8) -> T) -> Self {
+        let padded = count(descriptors).next_multiple_of(tile_rows);
+        let lines_per_query = DESCRIPTOR_LEN * size_of::<T>() / size_of::<Line>();
+        let mut lines: Vec<Line> = vec![Line::zeroed(); padded * lines_per_query];
+        let values: &mut [T] = bytemuck::cast_slice_mut(&mut lines);
+        for (target, &value) in values.iter_mut().zip(descriptors) {
+            *target = stored(value);
+        }
+        let mut terms = terms_of(descriptors);
+        terms.resize(padded, PADDING);
+        Self { lines, terms }
+    }
 }
 
 /// Best two per row or column, as parallel arrays; padding entries are never updated.
@@ -170,12 +225,7 @@ impl DescriptorBlock {
     }
 
     fn with_kernel(kernel: Kernel, descriptors: &[u8]) -> Self {
-        let base = match kernel {
-            Kernel::Scalar => pack_scalar(descriptors),
-            Kernel::Avx2 => avx2::pack_base(descriptors),
-            Kernel::Avx512 => avx512::pack_base(descriptors),
-        };
-        Self { kernel, len: count(descriptors), base }
+        Self { kernel, len: count(descriptors), base: kernel.pack_base(descriptors) }
     }
 
     /// Number of descriptors.
@@ -208,18 +258,10 @@ impl DescriptorBlock {
 
     fn search(&self, queries: &[u8], both: bool) -> (Vec<TwoNearest>, Vec<TwoNearest>) {
         let num_queries = count(queries);
-        let packed = match self.kernel {
-            Kernel::Scalar => pack_queries_scalar(queries),
-            Kernel::Avx2 => avx2::pack_queries(queries),
-            Kernel::Avx512 => avx512::pack_queries(queries),
-        };
+        let packed = self.kernel.pack_queries(queries);
         let mut rows = Slots::new(num_queries, packed.terms.len());
         let mut columns = Slots::new(self.len, self.base.terms.len());
-        match self.kernel {
-            Kernel::Scalar => search_scalar(&packed, &self.base, &mut rows, &mut columns),
-            Kernel::Avx2 => avx2::search(&packed, &self.base, &mut rows, &mut columns, both),
-            Kernel::Avx512 => avx512::search(&packed, &self.base, &mut rows, &mut columns, both),
-        }
+        self.kernel.search(&packed, &self.base, &mut rows, &mut columns, both);
         (rows.finish(num_queries), if both { columns.finish(self.len) } else { Vec::new() })
     }
 }
@@ -238,9 +280,11 @@ pub(super) fn squared_norm(descriptor: &[u8]) -> i32 {
     descriptor.iter().map(|&value| i32::from(value) * i32::from(value)).sum()
 }
 
-/// Squared distance of two descriptors.
-#[inline(always)]
-pub(super) fn distance2(first: &[u8], second: &[u8]) -> u32 {
+/// Squared Euclidean distance of two descriptors.
+///
+/// At most 128 · 255² < 2²³, so it is exact.
+#[inline]
+pub fn squared_distance(first: &[u8], second: &[u8]) -> u32 {
     first.iter().zip(second).map(|(&a, &b)| (i32::from(a) - i32::from(b)).pow(2)).sum::<i32>() as u32
 }
 
@@ -250,14 +294,6 @@ fn lines_of(bytes: &[u8]) -> Vec<Line> {
 
 fn terms_of(descriptors: &[u8]) -> Vec<i32> {
     descriptors.chunks_exact(DESCRIPTOR_LEN).map(squared_norm).collect()
-}
-
-fn pack_scalar(descriptors: &[u8]) -> PackedBase {
-    PackedBase { lines: lines_of(descriptors), terms: terms_of(descriptors) }
-}
-
-fn pack_queries_scalar(descriptors: &[u8]) -> PackedQueries {
-    PackedQueries { lines: lines_of(descriptors), terms: terms_of(descriptors) }
 }
 
 fn search_scalar(queries: &PackedQueries, base: &PackedBase, rows: &mut Slots, columns: &mut Slots) {
@@ -282,11 +318,10 @@ mod tests {
 
     fn kernels() -> Vec<Kernel> {
         let mut kernels = vec![Kernel::Scalar];
-        if avx2::is_available() {
-            kernels.push(Kernel::Avx2);
-        }
-        if avx512::is_available() {
-            kernels.push(Kernel::Avx512);
+        #[cfg(target_arch = "x86_64")]
+        {
+            kernels.extend(Avx2::detect().map(Kernel::Avx2));
+            kernels.extend(Avx512::detect().map(Kernel::Avx512));
         }
         kernels
     }
@@ -297,7 +332,7 @@ mod tests {
             .map(|query| {
                 let mut nearest = TwoNearest::NONE;
                 for (index, candidate) in base.chunks_exact(DESCRIPTOR_LEN).enumerate() {
-                    nearest.offer(index as u32, distance2(query, candidate));
+                    nearest.offer(index as u32, squared_distance(query, candidate));
                 }
                 nearest
             })

@@ -1,7 +1,11 @@
+#[cfg(target_arch = "x86_64")]
 mod avx2;
+#[cfg(target_arch = "x86_64")]
 mod avx512;
 mod guided;
 mod kernel;
+#[cfg(target_arch = "x86_64")]
+mod tiles;
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -10,7 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, FeatureError, ImageFeatures, Keypoint};
 pub use guided::{GuidedParams, match_guided};
-pub use kernel::{DescriptorBlock, TwoNearest, two_nearest};
+pub use kernel::{DescriptorBlock, TwoNearest, squared_distance, two_nearest};
 
 /// A putative or verified match: keypoint `first` of one image shows what keypoint `second` of another shows.
 #[derive(
@@ -33,6 +37,14 @@ pub struct Match {
     pub first: u32,
     /// Keypoint index in the second image.
     pub second: u32,
+}
+
+impl Match {
+    /// The same match with the two images exchanged.
+    #[must_use]
+    pub fn swapped(self) -> Self {
+        Self { first: self.second, second: self.first }
+    }
 }
 
 /// How to match two images.
@@ -134,6 +146,7 @@ pub fn match_features(params: &MatchParams, first: &ImageFeatures, second: &Imag
     match_simulated(first, second, own, |a, b| match_all(params, (first, a), (second, b)))
 }
 
+/// Bright and dark keypoints to match.
 type Parts = [Range<usize>; 2];
 
 /// Adds the matches of simulated views, each with the other image itself, to the images' own.
@@ -148,7 +161,7 @@ fn match_simulated(
     simulated.extend(second.simulated_parts().flat_map(|b| of_views(first.parts(), b)));
     simulated.sort_by_cached_key(|m| {
         let (a, b) = (first.descriptor(m.first as usize), second.descriptor(m.second as usize));
-        (kernel::distance2(a, b), *m)
+        (squared_distance(a, b), *m)
     });
     let mut matches = distinct(first, second, own.into_iter().chain(simulated));
     matches.sort_unstable();
@@ -189,8 +202,8 @@ fn distinct(first: &ImageFeatures, second: &ImageFeatures, found: impl Iterator<
 /// Matches some bright and some dark keypoints of two images.
 fn match_all(
     params: &MatchParams,
-    (first, first_parts): (&ImageFeatures, [Range<usize>; 2]),
-    (second, second_parts): (&ImageFeatures, [Range<usize>; 2]),
+    (first, first_parts): (&ImageFeatures, Parts),
+    (second, second_parts): (&ImageFeatures, Parts),
 ) -> Vec<Match> {
     // A spot brighter than its surround never shows what a darker one does, so half the products suffice.
     let mut matches = Vec::new();

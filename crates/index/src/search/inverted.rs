@@ -3,7 +3,7 @@ use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use setloc_features::DESCRIPTOR_LEN;
+use setloc_features::{DESCRIPTOR_LEN, DescriptorBlock};
 
 use crate::squared_distances;
 
@@ -14,7 +14,7 @@ const ROUNDS: usize = 8;
 
 /// A k-means quantizer with the rows that belong to each of its lists.
 ///
-/// Centroids are rounded to `u8`, so that one integer kernel serves assignment, search and ranking. (H. Jégou,
+/// Centroids are rounded to `u8`, so that integer kernels serve assignment, search and ranking. (H. Jégou,
 /// M. Douze, C. Schmid, "Product quantization for nearest neighbor search", PAMI 2011, section IV: inverted lists.)
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct InvertedLists {
@@ -37,17 +37,13 @@ impl InvertedLists {
             centroids.extend_from_slice(descriptor(descriptors, row));
         }
         training.sort_unstable();
+        let training: Vec<u8> =
+            training.iter().flat_map(|&row| descriptor(descriptors, row)).copied().collect();
         for _ in 0..ROUNDS {
-            let assigned: Vec<usize> = training
-                .par_iter()
-                .map(|&row| nearest_list(descriptor(descriptors, row), &centroids))
-                .collect();
-            update_centroids(&mut centroids, descriptors, &training, &assigned);
+            let assigned = nearest_lists(&training, &centroids);
+            update_centroids(&mut centroids, &training, &assigned);
         }
-        let assigned: Vec<usize> = (0..rows)
-            .into_par_iter()
-            .map(|row| nearest_list(descriptor(descriptors, row), &centroids))
-            .collect();
+        let assigned = nearest_lists(descriptors, &centroids);
         let mut order: Vec<u32> = (0..rows as u32).collect();
         order.sort_by_key(|&row| assigned[row as usize]);
         let mut starts = vec![0_u32; centroids.len() / DESCRIPTOR_LEN + 1];
@@ -85,20 +81,27 @@ fn descriptor(descriptors: &[u8], row: usize) -> &[u8] {
     &descriptors[row * DESCRIPTOR_LEN..(row + 1) * DESCRIPTOR_LEN]
 }
 
-fn nearest_list(descriptor: &[u8], centroids: &[u8]) -> usize {
-    let mut distances = vec![0; centroids.len() / DESCRIPTOR_LEN];
-    squared_distances(descriptor, centroids, &mut distances);
-    (0..distances.len()).min_by_key(|&list| distances[list]).unwrap_or(0)
+/// Descriptors that one thread assigns at a time.
+const ASSIGNED_AT_ONCE: usize = 256;
+
+/// The list whose centroid is nearest to each descriptor, the first of equally near ones.
+fn nearest_lists(descriptors: &[u8], centroids: &[u8]) -> Vec<usize> {
+    let centroids = DescriptorBlock::new(centroids);
+    descriptors
+        .par_chunks(ASSIGNED_AT_ONCE * DESCRIPTOR_LEN)
+        .flat_map_iter(|part| centroids.two_nearest(part))
+        .map(|nearest| nearest.index as usize)
+        .collect()
 }
 
 /// Moves each centroid to the mean of its descriptors; empty lists keep theirs.
-fn update_centroids(centroids: &mut [u8], descriptors: &[u8], training: &[usize], assigned: &[usize]) {
+fn update_centroids(centroids: &mut [u8], training: &[u8], assigned: &[usize]) {
     let lists = centroids.len() / DESCRIPTOR_LEN;
     let (mut sums, mut counts) = (vec![0_u32; centroids.len()], vec![0_u32; lists]);
-    for (&row, &list) in training.iter().zip(assigned) {
+    for (descriptor, &list) in training.chunks_exact(DESCRIPTOR_LEN).zip(assigned) {
         counts[list] += 1;
         let sum = &mut sums[list * DESCRIPTOR_LEN..(list + 1) * DESCRIPTOR_LEN];
-        for (sum, &byte) in sum.iter_mut().zip(descriptor(descriptors, row)) {
+        for (sum, &byte) in sum.iter_mut().zip(descriptor) {
             *sum += u32::from(byte);
         }
     }

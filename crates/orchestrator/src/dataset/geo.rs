@@ -2,10 +2,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
+use setloc_features::Wgs84;
 
 use super::find_by_name;
 use crate::error::Hinted;
-use crate::geodesy::Wgs84;
 
 /// Where measured positions come from.
 #[derive(Debug, Clone, PartialEq, Eq)]

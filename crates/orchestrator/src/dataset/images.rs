@@ -2,12 +2,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use rayon::prelude::*;
-use setloc_features::Camera;
+use setloc_features::{Camera, Wgs84};
 
 use super::{CameraBook, GeoBook, GeoSource};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
-use crate::geodesy::Wgs84;
 use crate::stages;
 
 /// Endings of files that are taken as images, lower case.

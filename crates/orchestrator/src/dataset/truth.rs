@@ -4,9 +4,8 @@ use std::path::Path;
 use anyhow::{Context, Result};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use serde::Deserialize;
+use setloc_features::Wgs84;
 use setloc_sfm::Rigid;
-
-use crate::geodesy::Wgs84;
 
 /// One image's true pose in `truth.json`.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]

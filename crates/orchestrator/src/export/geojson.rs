@@ -1,9 +1,9 @@
 use anyhow::{Context, Result};
 use serde_json::{Value, json};
+use setloc_features::Wgs84;
 use setloc_sfm::Rigid;
 
 use crate::error::Hinted;
-use crate::geodesy::Wgs84;
 
 /// Camera positions as GeoJSON points, with the heading of the optical axis in degrees from north.
 ///

@@ -1,8 +1,8 @@
 use serde_json::{Value, json};
 use setloc_camset::PhotoLocalization;
+use setloc_features::Wgs84;
 use setloc_sfm::{ImageId, Rigid};
 
-use crate::geodesy::Wgs84;
 use crate::scene::SceneFile;
 
 /// `world_from_camera` as quaternion (w, x, y, z) and centre.

@@ -273,7 +273,7 @@ fn run_model(
     for &(a, b, swapped) in input.pairs {
         let matches = inputs.find::<PairMatches>(&matches_role(a, b))?;
         if let (Some(matches), Some(&first), Some(&second)) = (matches, id_of.get(&a), id_of.get(&b)) {
-            let turned = |m: &Match| if swapped { Match { first: m.second, second: m.first } } else { *m };
+            let turned = |m: &Match| if swapped { m.swapped() } else { *m };
             putative.push(PutativePair { first, second, matches: matches.0.iter().map(turned).collect() });
         }
         let verified = inputs.find::<VerifiedPair>(&pair_role(a, b))?;

@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use anyhow::Result;
 use nalgebra::Vector3;
 use serde_json::json;
-use setloc_features::ImageFeatures;
+use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
 use setloc_sfm::{MapperOutput, Reconstruction};
 
@@ -11,7 +11,6 @@ use super::model::{ModelJobs, ModelKind, add_model, image_of_place_holder, with_
 use crate::config::Config;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
-use crate::geodesy::Wgs84;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
 use crate::scene::SceneFile;
 use crate::stages;

@@ -3,9 +3,9 @@ use setloc_features::{GuidedParams, match_guided};
 
 use super::{correspondence::CorrespondenceGraph, direction, model::Model, standpoint::in_view};
 use crate::{
-    ImageId, Observation, PairGeometry, PointId, Rigid, TwoViewKind,
+    ImageId, Observation, PointId, Rigid, TwoViewKind,
     robust::{RansacParams, estimate_absolute_pose, refine_absolute_pose},
-    solvers::essential::essential_from_pose,
+    solvers::{essential::essential_from_pose, triangulation::length_along},
     visibility::is_same_view,
 };
 
@@ -152,25 +152,18 @@ pub(super) fn hypothesize_from_pairs(
     };
     let mut hypotheses = Vec::new();
     for pair in model.input.pairs {
-        let image_from_other = match image {
-            _ if image == pair.second => pair.two_view.second_from_first,
-            _ if image == pair.first => pair.two_view.second_from_first.inverse(),
-            _ => continue,
-        };
-        let other = if image == pair.first { pair.second } else { pair.first };
+        let Some((other, image_from_other)) = pair.seen_from(image) else { continue };
         let Some(pose) = &model.poses[other.index()] else { continue };
         if pair.two_view.kind == TwoViewKind::PureRotation {
             continue;
         }
         let world_from_image = pose.world_from_camera * image_from_other.inverse();
         let step = world_from_image.translation - pose.center();
-        // The centre lies at other + s·step; each point asks for the s that puts it on its ray: (X − C)×r = s·(step×r).
+        // The centre lies at other + s·step; each point asks for the s that puts it on its ray.
         let mut lengths: Vec<f64> = (0..points.len())
             .filter_map(|index| {
                 let ray = world_from_image.rotation * bearings[index];
-                let (wanted, lever) = ((points[index] - pose.center()).cross(&ray), step.cross(&ray));
-                let length = wanted.dot(&lever) / lever.norm_squared();
-                (length.is_finite() && length > 0.0).then_some(length)
+                length_along(&step, &(points[index] - pose.center()), &ray)
             })
             .collect();
         if lengths.len() < params.min_inliers {
@@ -208,18 +201,16 @@ const BASELINE_LEAD: f64 = 2.5;
 /// Lengths by less than this factor apart are one.
 const SAME_LENGTH: f64 = 1.25;
 
-/// The pose of `image` from its verified pair with the registered image `other`, the length of the baseline from
+/// The pose of `image` from its verified geometry with the registered image `other`, the length of the baseline from
 /// matches along the pair's epipolar circles; `None` unless one length stands out.
 pub(super) fn hypothesize_baseline(
     model: &Model<'_>,
-    pair: &PairGeometry,
     image: ImageId,
     other: ImageId,
+    image_from_other: &Rigid,
     params: &RansacParams,
 ) -> Option<PoseHypothesis> {
     let pose = model.poses[other.index()].as_ref()?;
-    let second_from_first = pair.two_view.second_from_first;
-    let image_from_other = if image == pair.second { second_from_first } else { second_from_first.inverse() };
     let world_from_image = pose.world_from_camera * image_from_other.inverse();
     let step = world_from_image.translation - pose.center();
     let features = |image: ImageId| (model.input.images[image.index()].features, &model.rays[image.index()]);
@@ -227,7 +218,7 @@ pub(super) fn hypothesize_baseline(
         &GuidedParams::default(),
         features(other),
         features(image),
-        &essential_from_pose(&image_from_other),
+        &essential_from_pose(image_from_other),
     );
     let rays = &model.rays[image.index()];
     let mut candidates: Vec<(u32, PointId, Vector3<f64>)> = Vec::new();
@@ -236,9 +227,9 @@ pub(super) fn hypothesize_baseline(
         let Some(id) = model.point_of(Observation { image: other, feature: m.first }) else { continue };
         let Some(point) = model.point(id) else { continue };
         let ray = world_from_image.rotation * rays.bearings[m.second as usize];
-        let (wanted, lever) = ((point.position - pose.center()).cross(&ray), step.cross(&ray));
-        let length = wanted.dot(&lever) / lever.norm_squared();
-        if length.is_finite() && length > 0.0 && rays.sigmas[m.second as usize].is_finite() {
+        if let Some(length) = length_along(&step, &(point.position - pose.center()), &ray)
+            && rays.sigmas[m.second as usize].is_finite()
+        {
             candidates.push((m.second, id, point.position));
             lengths.push(length);
         }

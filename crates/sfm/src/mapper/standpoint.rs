@@ -6,6 +6,7 @@
 //! photos of one standpoint are mapped as one mosaic on the sphere: all their rays in one frame, matched, verified and
 //! resected together, and taken apart again afterwards.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use nalgebra::{UnitQuaternion, Vector3};
@@ -43,20 +44,14 @@ impl Mosaic {
 
 /// Whether a direction of the camera's frame falls into its image.
 pub(super) fn in_view(camera: &Camera, direction: &Vector3<f64>) -> bool {
-    camera.is_panoramic()
-        || camera.project(direction).is_some_and(|pixel| {
-            pixel.x >= 0.0
-                && pixel.y >= 0.0
-                && pixel.x < f64::from(camera.width)
-                && pixel.y < f64::from(camera.height)
-        })
+    camera.is_panoramic() || camera.project(direction).is_some_and(|pixel| camera.contains(&pixel))
 }
 
 /// The input with mosaics in place of photos from one standpoint.
 pub(super) struct Standpoints<'a> {
     original: &'a MapperInput<'a>,
     mosaics: Vec<Mosaic>,
-    features: Vec<ImageFeatures>,
+    features: Vec<Cow<'a, ImageFeatures>>,
     cameras: Vec<Camera>,
     camera_fixed: Vec<bool>,
     camera_of: Vec<CameraId>,
@@ -66,12 +61,18 @@ pub(super) struct Standpoints<'a> {
 impl<'a> Standpoints<'a> {
     /// Joins what was taken from one standpoint; `None` when nothing was.
     pub fn find(params: &MapperParams, input: &'a MapperInput<'a>, seed: u64) -> Option<Self> {
+        let mut turns = candidate_turns(params, input);
+        if turns.is_empty() {
+            return None;
+        }
         let rays: Vec<Rays> = input
             .images
             .iter()
             .map(|image| image.features.rays(&input.cameras[image.camera.index()]))
             .collect();
-        let groups = groups(params, input, &rays);
+        turns
+            .retain(|pair| is_mere_turn(params, pair, &rays) && sees_the_overlap(params, input, pair, &rays));
+        let groups = groups(input.images.len(), &turns);
         if groups.iter().all(|members| members.len() == 1) {
             return None;
         }
@@ -103,7 +104,7 @@ impl<'a> Standpoints<'a> {
                 InputImage {
                     name: of(&mosaic.members[0]).name,
                     camera,
-                    features,
+                    features: features.as_ref(),
                     position_prior: mosaic.members.iter().find_map(|member| of(member).position_prior),
                     mosaic: (mosaic.members.len() > 1).then_some(mosaic),
                 }
@@ -170,7 +171,7 @@ impl<'a> Standpoints<'a> {
         }
         let first = images[members[0].0.index()];
         if members.len() == 1 {
-            self.features.push(first.features.clone());
+            self.features.push(Cow::Borrowed(first.features));
             mosaic.origin = (0..first.features.len() as u32)
                 .map(|feature| Observation { image: members[0].0, feature })
                 .collect();
@@ -179,7 +180,7 @@ impl<'a> Standpoints<'a> {
             let finest = mosaic.members.iter().map(|member| member.camera.focal_length()).fold(0.0, f64::max);
             let height = (finest * std::f64::consts::PI).round().clamp(16.0, 32_768.0) as u32;
             let sphere = Camera::equirectangular(2 * height, height);
-            self.features.push(joined_features(&mut mosaic, images, rays, &sphere));
+            self.features.push(Cow::Owned(joined_features(&mut mosaic, images, rays, &sphere)));
             self.camera_of.push(CameraId(self.cameras.len() as u32));
             self.cameras.push(sphere);
             self.camera_fixed.push(true);
@@ -207,9 +208,11 @@ impl<'a> Standpoints<'a> {
                 return;
             }
             let moved = found.iter().filter_map(|m| {
-                let x = *place[first.index()].get(m.first as usize)?;
-                let y = *place[second.index()].get(m.second as usize)?;
-                Some(if a < b { Match { first: x, second: y } } else { Match { first: y, second: x } })
+                let moved = Match {
+                    first: *place[first.index()].get(m.first as usize)?,
+                    second: *place[second.index()].get(m.second as usize)?,
+                };
+                Some(if a < b { moved } else { moved.swapped() })
             });
             matches.entry((a.min(b), a.max(b))).or_default().extend(moved);
         };
@@ -308,16 +311,11 @@ fn joined_features(
     joined
 }
 
-/// Photos by standpoint, each with the turn from the frame of its standpoint's first photo.
+/// Pairs of photos that may differ by a turn only, best supported first.
 ///
 /// Only photos of known intrinsics are joined: a wrong focal length would bend the mosaic. Panoramas see everything
 /// already.
-fn groups(
-    params: &MapperParams,
-    input: &MapperInput<'_>,
-    rays: &[Rays],
-) -> Vec<Vec<(ImageId, UnitQuaternion<f64>)>> {
-    let count = input.images.len();
+fn candidate_turns<'a>(params: &MapperParams, input: &MapperInput<'a>) -> Vec<&'a PairGeometry> {
     let mut turns: Vec<&PairGeometry> = input
         .pairs
         .iter()
@@ -330,11 +328,14 @@ fn groups(
                 && pair.two_view.inliers.len() >= params.min_turn_matches
                 && known(pair.first)
                 && known(pair.second)
-                && is_mere_turn(params, pair, rays)
-                && sees_the_overlap(params, input, pair, rays)
         })
         .collect();
     turns.sort_by_key(|pair| (std::cmp::Reverse(pair.two_view.inliers.len()), pair.first, pair.second));
+    turns
+}
+
+/// Photos by standpoint, each with the turn from the frame of its standpoint's first photo; better turns come first.
+fn groups(count: usize, turns: &[&PairGeometry]) -> Vec<Vec<(ImageId, UnitQuaternion<f64>)>> {
     let mut group_of: Vec<usize> = (0..count).collect();
     let mut from_group: Vec<UnitQuaternion<f64>> = vec![UnitQuaternion::identity(); count];
     for pair in turns {

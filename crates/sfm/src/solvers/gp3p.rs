@@ -2,9 +2,9 @@ use nalgebra::Vector3;
 
 use super::quadrics::intersect_quadrics;
 use super::rotation_quadric::{
-    cayley_numerator, eliminate_columns, generic_rotation, inverse_rotation, rotation_quadric,
+    cayley_numerator, eliminate_columns, generic_rotation, inverse_rotation, rotation_quadric, rotation_row,
 };
-use super::{Solutions, tangent_basis};
+use super::{Solutions, reach, tangent_basis};
 use crate::Rigid;
 
 /// Finds world_from_set of known scale from three rays of a camera set and the points they see.
@@ -22,7 +22,7 @@ pub fn gp3p(
 ) -> Solutions<Rigid, 8> {
     let mut solutions = Solutions::default();
     let turn = generic_rotation();
-    let unit = points_in_world[1..].iter().map(|x| (x - points_in_world[0]).norm()).fold(0.0, f64::max);
+    let unit = reach(points_in_world);
     if !(unit > 0.0) {
         return solutions;
     }
@@ -34,19 +34,9 @@ pub fn gp3p(
         let x = turn * (points_in_world[i] - points_in_world[0]) / unit;
         let p = (origins_in_set[i] - origins_in_set[0]) / unit;
         for (row, n) in [(2 * i - 2, u), (2 * i - 1, v)] {
-            rows[row] = [
-                n.dot(&first),
-                n.x * x.x,
-                n.x * x.y,
-                n.x * x.z,
-                n.y * x.x,
-                n.y * x.y,
-                n.y * x.z,
-                n.z * x.x,
-                n.z * x.y,
-                n.z * x.z,
-                -n.dot(&p),
-            ];
+            rows[row][0] = n.dot(&first);
+            rows[row][1..10].copy_from_slice(&rotation_row(&n, &x));
+            rows[row][10] = -n.dot(&p);
         }
     }
     if !eliminate_columns(&mut rows, 1) {

@@ -2,9 +2,9 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::quadrics::{evaluate_quadric, intersect_quadrics};
 use super::rotation_quadric::{
-    cayley_numerator, eliminate_columns, generic_rotation, inverse_rotation, rotation_quadric,
+    cayley_numerator, eliminate_columns, generic_rotation, inverse_rotation, rotation_quadric, rotation_row,
 };
-use super::{Solutions, tangent_basis};
+use super::{Solutions, reach, tangent_basis};
 use crate::Similarity;
 
 /// Finds world_from_set = (s, R, t) from four rays of a camera set and the points they see.
@@ -26,11 +26,9 @@ pub fn gp4ps(
 ) -> Solutions<Similarity, 8> {
     let mut solutions = Solutions::<(f64, Similarity), 8>::default();
     let turn = generic_rotation();
-    let unit = points_in_world[1..].iter().map(|x| (x - points_in_world[0]).norm()).fold(0.0, f64::max);
-    let reach = origins_in_set[1..].iter().map(|p| (p - origins_in_set[0]).norm()).fold(0.0, f64::max);
-    let mut sorted = Solutions::default();
+    let (unit, reach) = (reach(points_in_world), reach(origins_in_set));
     if !(unit > 0.0) || !(reach > 0.0) {
-        return sorted;
+        return Solutions::default();
     }
     // Unknowns (s·λ₁, s | Rᵀ by rows); relative to ray 1's origin and point, in units of their extents.
     let first = directions_in_set[0];
@@ -40,23 +38,12 @@ pub fn gp4ps(
         let x = turn * (points_in_world[i] - points_in_world[0]) / unit;
         let p = (origins_in_set[i] - origins_in_set[0]) / reach;
         for (row, n) in [(2 * i - 2, u), (2 * i - 1, v)] {
-            rows[row] = [
-                n.dot(&first),
-                -n.dot(&p),
-                n.x * x.x,
-                n.x * x.y,
-                n.x * x.z,
-                n.y * x.x,
-                n.y * x.y,
-                n.y * x.z,
-                n.z * x.x,
-                n.z * x.y,
-                n.z * x.z,
-            ];
+            rows[row][..2].copy_from_slice(&[n.dot(&first), -n.dot(&p)]);
+            rows[row][2..].copy_from_slice(&rotation_row(&n, &x));
         }
     }
     if !eliminate_columns(&mut rows, 2) {
-        return sorted;
+        return Solutions::default();
     }
     let quadrics = [2, 3, 4, 5].map(|k| rotation_quadric(&rows[k][2..], 0.0));
     let [q0, q1, q2, q3] = quadrics;
@@ -91,11 +78,7 @@ pub fn gp4ps(
         let similarity = Similarity { scale, rotation, translation: points_in_world[0] - rotation * in_set };
         solutions.push((residual, similarity));
     }
-    solutions.sort_by_key(|(residual, _)| *residual);
-    for (_, similarity) in &solutions {
-        sorted.push(*similarity);
-    }
-    sorted
+    solutions.by_residual()
 }
 
 #[cfg(test)]

@@ -29,12 +29,11 @@ const MIX: [f64; 3] = [0.61, -0.37, 0.83];
 /// J. Heller, A. Fitzgibbon, CVPR 2016, and the fourth orders the solutions. At most 8. Degenerate when three points
 /// are collinear, and for planes parallel to the image (focal length and distance are then one unknown).
 pub fn p4pf(pixels: &[Vector2<f64>; 4], points_in_world: &[Vector3<f64>; 4]) -> Solutions<PoseWithFocal, 8> {
-    let mut sorted = Solutions::default();
     let mean = points_in_world.iter().sum::<Vector3<f64>>() / 4.0;
     let unit = points_in_world.iter().map(|x| (x - mean).norm()).fold(0.0, f64::max);
     let reach = pixels.iter().map(nalgebra::Matrix::norm).fold(0.0, f64::max);
     if !(unit > 0.0) || !(reach > 0.0) {
-        return sorted;
+        return Solutions::default();
     }
     let points = points_in_world.map(|x| (x - mean) / unit);
     let mut columns = [[0.0; 12]; 8];
@@ -86,11 +85,7 @@ pub fn p4pf(pixels: &[Vector2<f64>; 4], points_in_world: &[Vector3<f64>; 4]) -> 
         let world_from_camera = camera_from_world.inverse();
         solutions.push((residual, PoseWithFocal { world_from_camera, focal: focal * reach }));
     }
-    solutions.sort_by_key(|(residual, _)| *residual);
-    for (_, solution) in &solutions {
-        sorted.push(*solution);
-    }
-    sorted
+    solutions.by_residual()
 }
 
 /// The quadric of the symmetric part of a form over the four basis vectors, the last of weight 1.

@@ -49,6 +49,12 @@ pub(super) fn rotation_quadric(a: &[f64], constant: f64) -> Quadric {
     ]
 }
 
+/// Coefficients of nᵀ·Rᵀ·x in the nine entries of Rᵀ by rows.
+#[inline(always)]
+pub(super) fn rotation_row(n: &Vector3<f64>, x: &Vector3<f64>) -> [f64; 9] {
+    [n.x * x.x, n.x * x.y, n.x * x.z, n.y * x.x, n.y * x.y, n.y * x.z, n.z * x.x, n.z * x.y, n.z * x.z]
+}
+
 /// World from set of a set_from_world rotation matrix.
 #[inline]
 pub(super) fn inverse_rotation(set_from_world: &Matrix3<f64>) -> UnitQuaternion<f64> {

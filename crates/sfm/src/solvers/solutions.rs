@@ -31,6 +31,18 @@ impl<T: Copy + Default, const N: usize> Solutions<T, N> {
     }
 }
 
+impl<T: Copy + Default, const N: usize> Solutions<(f64, T), N> {
+    /// The solutions without their residuals, smallest residual first.
+    pub fn by_residual(mut self) -> Solutions<T, N> {
+        self.sort_by_key(|(residual, _)| *residual);
+        let mut sorted = Solutions::default();
+        for (_, solution) in &self {
+            sorted.push(*solution);
+        }
+        sorted
+    }
+}
+
 impl<T, const N: usize> Deref for Solutions<T, N> {
     type Target = [T];
 
@@ -60,5 +72,14 @@ mod tests {
         assert!(!list.push(9));
         list.sort_by_key(|item| f64::from(*item));
         assert_eq!(&*list, &[3, 7]);
+    }
+
+    #[test]
+    fn residuals_order_the_solutions() {
+        let mut list = Solutions::<(f64, char), 3>::default();
+        for item in [(0.5, 'c'), (f64::NAN, 'd'), (0.1, 'a')] {
+            assert!(list.push(item));
+        }
+        assert_eq!(&*list.by_residual(), &['a', 'c', 'd']);
     }
 }

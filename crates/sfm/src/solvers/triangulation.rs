@@ -64,6 +64,26 @@ pub fn max_triangulation_angle(rays: &[WorldRay], point_in_world: &Vector3<f64>)
     largest
 }
 
+/// How many steps a camera has to go for its ray to meet a point.
+///
+/// Equation: X = C + s·d + λ·r, whose product with r leaves (X − C)×r = s·(d×r), three equations of rank two; s is their
+/// least-squares solution. `step` is d, `offset` X − C and `ray` r (unit), all in one frame; λ may have either sign.
+/// `None` when s is not positive or the step runs along the ray.
+///
+/// ```
+/// use nalgebra::Vector3;
+/// use setloc_sfm::solvers::triangulation::length_along;
+///
+/// // Three steps along x, and the point lies straight ahead.
+/// let length = length_along(&Vector3::x(), &Vector3::new(3.0, 0.0, 7.0), &Vector3::z());
+/// assert_eq!(length, Some(3.0));
+/// ```
+pub fn length_along(step: &Vector3<f64>, offset: &Vector3<f64>, ray: &Vector3<f64>) -> Option<f64> {
+    let (wanted, lever) = (offset.cross(ray), step.cross(ray));
+    let length = wanted.dot(&lever) / lever.norm_squared();
+    (length.is_finite() && length > 0.0).then_some(length)
+}
+
 /// Triangulates a point from two bearings; in the second camera's frame.
 ///
 /// One bearing is first turned by the smallest angle that brings both into a common epipolar plane, where the rays
@@ -218,6 +238,22 @@ mod tests {
             expected += linearize(&rays, &point).0.try_inverse().unwrap().trace();
         }
         assert!((squared / expected - 1.0).abs() < 0.2, "{}", squared / expected);
+    }
+
+    #[test]
+    fn the_length_of_a_baseline_is_recovered_all_around() {
+        let mut rng = seeded("length_along");
+        for _ in 0..300 {
+            let (step, ray) = (random_unit(&mut rng), random_unit(&mut rng));
+            let length = rng.random_range(0.1..10.0);
+            let offset = step * length + ray * rng.random_range(1.0..20.0);
+            let found = length_along(&step, &offset, &ray).unwrap();
+            let sine = step.cross(&ray).norm();
+            assert!((found - length).abs() * sine < 1e-9 * length, "{found} {length}");
+            assert_eq!(length_along(&-step, &offset, &ray), None);
+        }
+        // A step along the ray says nothing of its length.
+        assert_eq!(length_along(&Vector3::z(), &Vector3::new(0.0, 0.0, 5.0), &Vector3::z()), None);
     }
 
     #[test]

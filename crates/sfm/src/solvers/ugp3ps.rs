@@ -1,7 +1,7 @@
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
 
 use super::rotation_quadric::eliminate_columns;
-use super::{Solutions, tangent_basis};
+use super::{Solutions, reach, tangent_basis};
 use crate::Similarity;
 
 /// Finds world_from_set = (s, R, t) with a known vertical from three rays of a camera set and their points.
@@ -13,19 +13,17 @@ use crate::Similarity;
 ///
 /// The problem of gP4P+s (C. Sweeney et al., "gDLS: A Scalable Solution to the Generalized Pose and Scale Problem",
 /// ECCV 2014) with a known vertical. The combination of the two equations that constrains the angle most is met exactly
-/// (two angles), Gauss–Newton steps on the angle weigh in the other. At most 2 solutions, the better one first. Degenerate when all rays meet in one point, and when the points lie on one
-/// vertical.
+/// (two angles), Gauss–Newton steps on the angle weigh in the other. At most 2 solutions, the better one first.
+/// Degenerate when all rays meet in one point, and when the points lie on one vertical.
 pub fn ugp3ps(
     origins_in_set: &[Vector3<f64>; 3],
     directions_in_set: &[Vector3<f64>; 3],
     points_in_world: &[Vector3<f64>; 3],
 ) -> Solutions<Similarity, 2> {
     let mut solutions = Solutions::<(f64, Similarity), 2>::default();
-    let mut sorted = Solutions::default();
-    let unit = points_in_world[1..].iter().map(|x| (x - points_in_world[0]).norm()).fold(0.0, f64::max);
-    let reach = origins_in_set[1..].iter().map(|p| (p - origins_in_set[0]).norm()).fold(0.0, f64::max);
+    let (unit, reach) = (reach(points_in_world), reach(origins_in_set));
     if !(unit > 0.0) || !(reach > 0.0) {
-        return sorted;
+        return Solutions::default();
     }
     // Unknowns s·λ₁, s | cos, sin, 1, relative to ray 1's origin and point: Rᵀ·x = (c·x + s·y, c·y − s·x, z).
     let first = directions_in_set[0];
@@ -39,7 +37,7 @@ pub fn ugp3ps(
         }
     }
     if !eliminate_columns(&mut rows, 2) {
-        return sorted;
+        return Solutions::default();
     }
     let ([_, _, a0, b0, d0], [_, _, a1, b1, d1]) = (rows[2], rows[3]);
     // Jacobi rotation of the two rows: the first then has the largest possible (a, b).
@@ -48,13 +46,13 @@ pub fn ugp3ps(
     let strong = Vector3::new(a0, b0, d0) * turn_cos + Vector3::new(a1, b1, d1) * turn_sin;
     let size = strong.x.hypot(strong.y);
     if !(size > 0.0) {
-        return sorted;
+        return Solutions::default();
     }
     let middle = strong.y.atan2(strong.x);
     // Noise may push the cosine just beyond 1: the nearest angle is then the double one.
     let ratio = -strong.z / size;
     if !(ratio.abs() < 1.5) {
-        return sorted;
+        return Solutions::default();
     }
     let spread = ratio.clamp(-1.0, 1.0).acos();
     for start in [middle + spread, middle - spread] {
@@ -96,11 +94,7 @@ pub fn ugp3ps(
             solutions.push((residual, Similarity { scale, rotation, translation }));
         }
     }
-    solutions.sort_by_key(|(residual, _)| *residual);
-    for (_, similarity) in &solutions {
-        sorted.push(*similarity);
-    }
-    sorted
+    solutions.by_residual()
 }
 
 #[cfg(test)]

@@ -1,5 +1,3 @@
-//! WGS84 to local east-north-up metres and back.
-
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
@@ -8,13 +6,13 @@ const A: f64 = 6_378_137.0;
 /// First eccentricity squared of WGS84.
 const E2: f64 = 6.694_379_990_141_316_5e-3;
 
-/// A place: degrees and metres above the ellipsoid.
+/// A place on the WGS84 ellipsoid, to local east-north-up metres and back.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Wgs84 {
-    /// Latitude in degrees.
+    /// Latitude in degrees, north positive.
     pub lat: f64,
-    /// Longitude in degrees.
+    /// Longitude in degrees, east positive.
     pub lon: f64,
     /// Metres above the ellipsoid.
     pub alt: f64,
@@ -77,6 +75,27 @@ mod tests {
             let back = Wgs84::from_enu(&enu, origin).to_enu(origin);
             assert!((back - enu).norm() < 1e-6, "{enu} {back}");
         }
+    }
+
+    #[test]
+    fn round_trip_is_exact_from_pole_to_pole() {
+        for lat in [-89.0, -33.0, 0.0, 48.86, 89.9] {
+            let place = Wgs84 { lat, lon: -71.3, alt: 35.0 };
+            let origin = Wgs84 { lat: lat - 0.01, lon: -71.31, alt: 0.0 };
+            let back = Wgs84::from_enu(&place.to_enu(origin), origin);
+            assert!((back.lat - lat).abs() < 1e-10 && (back.lon + 71.3).abs() < 1e-10);
+            assert!((back.alt - 35.0).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn a_kilometre_north_follows_the_meridian() {
+        let origin = Wgs84 { lat: 45.0, lon: 7.0, alt: 100.0 };
+        let north = Wgs84::from_enu(&Vector3::new(0.0, 1000.0, 0.0), origin);
+        // Meridian radius at 45°: a(1 − e²) / (1 − e²/2)^1.5 = 6 367 381.8 m, plus the altitude.
+        assert!((north.lat - 45.0 - (1000.0 / 6_367_481.8_f64).to_degrees()).abs() < 1e-8);
+        assert!((north.lon - 7.0).abs() < 1e-12);
+        assert!((north.alt - 100.0 - 1000.0 * 1000.0 / 2.0 / 6_367_481.8).abs() < 1e-3);
     }
 
     #[test]
