@@ -54,7 +54,7 @@ pub fn build_scene(
     session.run(name, &graph, |executor, run| {
         session.remember(name, run)?;
         let mut skipped = folder.skipped.clone();
-        for (image, job) in folder.images.iter().zip(&jobs.model.features) {
+        for (image, job) in folder.images.iter().zip(&jobs.features) {
             if let Some(reason) = run.failed.get(&graph.job(*job).label()) {
                 skipped.push(SkippedImage { name: image.name.clone(), reason: reason.clone() });
             }
@@ -74,7 +74,7 @@ pub fn build_scene(
         }
         let scene = executor.load::<SceneFile>(jobs.scene)?;
         let mut features = BTreeMap::new();
-        for (image, job) in folder.images.iter().zip(&jobs.model.features) {
+        for (image, job) in folder.images.iter().zip(&jobs.features) {
             if executor.output(*job).is_some() {
                 features.insert(image.name.clone(), executor.load::<ImageFeatures>(*job)?);
             }

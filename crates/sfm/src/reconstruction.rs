@@ -78,6 +78,25 @@ impl Reconstruction {
             .filter(|id| self.images[id.index()].world_from_camera.is_some())
     }
 
+    /// The same with images in the order of their names, as people list them.
+    pub fn by_name(&self) -> Self {
+        let mut order: Vec<usize> = (0..self.images.len()).collect();
+        order.sort_by(|&a, &b| self.images[a].name.cmp(&self.images[b].name));
+        let mut id_of = vec![ImageId(0); order.len()];
+        for (id, &at) in order.iter().enumerate() {
+            id_of[at] = ImageId(id as u32);
+        }
+        let mut points = self.points.clone();
+        for point in &mut points {
+            for observation in &mut point.track {
+                observation.image = id_of[observation.image.index()];
+            }
+            point.track.sort_unstable();
+        }
+        let images = order.iter().map(|&at| self.images[at].clone()).collect();
+        Self { cameras: self.cameras.clone(), images, points }
+    }
+
     /// The camera of an image.
     pub fn camera_of(&self, image: ImageId) -> &Camera {
         &self.cameras[self.images[image.index()].camera.index()]
@@ -97,5 +116,36 @@ impl Reconstruction {
         for point in &mut self.points {
             point.position = target_from_world.transform_point(&point.position);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn by_name_every_observation_stays_with_its_image() {
+        let image = |name: &str, camera| ReconstructionImage {
+            name: name.to_owned(),
+            camera: CameraId(camera),
+            world_from_camera: None,
+        };
+        let seen = |image, feature| Observation { image: ImageId(image), feature };
+        let point = |track: Vec<Observation>| ReconstructionPoint {
+            position: Vector3::zeros(),
+            color: [0; 3],
+            error_sigma: 1.0,
+            track,
+        };
+        let model = Reconstruction {
+            cameras: Vec::new(),
+            images: vec![image("c", 0), image("a", 1), image("b", 2)],
+            points: vec![point(vec![seen(0, 7), seen(1, 8)]), point(vec![seen(1, 5), seen(2, 6)])],
+        };
+        let listed = model.by_name();
+        assert_eq!(listed.images, [image("a", 1), image("b", 2), image("c", 0)]);
+        assert_eq!(listed.points[0].track, [seen(0, 8), seen(2, 7)]);
+        assert_eq!(listed.points[1].track, [seen(0, 5), seen(1, 6)]);
+        assert_eq!(listed.by_name(), listed);
     }
 }

@@ -129,8 +129,7 @@ pub fn scene_markers(model: &Reconstruction) -> Vec<Marker> {
 
 /// Poses, point cloud, COLMAP model, picture and report.
 pub fn write_exports(folder: &Path, built: &Built, session: &Session) -> Result<()> {
-    let empty = Reconstruction::default();
-    let model = built.scene.main().unwrap_or(&empty);
+    let model = &built.scene.main().map_or_else(Reconstruction::default, Reconstruction::by_name);
     let markers = scene_markers(model);
     let centres: Vec<_> =
         markers.iter().map(|marker| (marker.world_from_camera.translation, marker.color)).collect();

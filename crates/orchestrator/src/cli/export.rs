@@ -13,8 +13,7 @@ use crate::store::write_atomically;
 /// `setloc export`
 pub fn run(args: &ExportArgs) -> Result<Answer> {
     let scene = SceneFile::read(&args.scene)?;
-    let empty = Reconstruction::default();
-    let model = scene.main().unwrap_or(&empty);
+    let model = &scene.main().map_or_else(Reconstruction::default, Reconstruction::by_name);
     let needs_output =
         || Hinted::error("this format is not written to standard output", "name a file or folder with -o");
     let markers = scene_markers(model);

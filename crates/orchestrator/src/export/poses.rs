@@ -14,7 +14,8 @@ pub fn pose_json(pose: &Rigid) -> Value {
 /// All cameras and poses of a scene.
 pub fn scene_json(scene: &SceneFile) -> Value {
     let components: Vec<Value> = scene.components.iter().map(|model| {
-        let observations = observations_of(model);
+        let model = model.by_name();
+        let observations = observations_of(&model);
         let images: Vec<Value> = (0..model.images.len() as u32).map(ImageId).map(|id| {
             let image = &model.images[id.index()];
             let pose = image.world_from_camera.as_ref();

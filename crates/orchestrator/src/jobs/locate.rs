@@ -7,8 +7,8 @@ use setloc_camset::{QueryPhoto, Scene, SetLocalization, locate_set, locate_singl
 use setloc_features::ImageFeatures;
 use setloc_sfm::{MapperOutput, Reconstruction};
 
-use super::derived_seed;
-use super::model::{ModelJobs, ModelKind, add_model};
+use super::model::{ModelJobs, ModelKind, ModelSource, add_model};
+use super::{choose_pairs, derived_seed};
 use crate::config::Config;
 use crate::dataset::SourceImage;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
@@ -46,7 +46,9 @@ pub fn add_set(
     what: &LocateJobs,
 ) -> Result<SetJobs> {
     let positions = vec![None; photos.len()];
-    let model = add_model(graph, ModelKind::Local, name, photos, &positions, &what.config, what.seed)?;
+    let pairs = choose_pairs(&what.config.pairs, &positions);
+    let source = ModelSource { images: photos, positions: &positions, pairs: &pairs };
+    let model = add_model(graph, ModelKind::Local, name, source, &what.config, what.seed)?;
     let listed: Vec<_> = photos.iter().map(|p| json!([p.name, p.camera, p.camera_fixed])).collect();
     let params = json!({ "camset": what.config.camset, "seed": what.seed, "photos": listed });
     let (owned, what_here) = (photos.to_vec(), what.clone());

@@ -14,7 +14,7 @@ use setloc_sfm::{
     verify_pair,
 };
 
-use super::{choose_pairs, derived_seed};
+use super::derived_seed;
 use crate::artifacts::{PairMatches, VerifiedPair};
 use crate::config::Config;
 use crate::dataset::SourceImage;
@@ -40,6 +40,17 @@ pub struct ModelJobs {
     pub model: JobId,
 }
 
+/// What a model is made of.
+#[derive(Debug, Clone, Copy)]
+pub struct ModelSource<'a> {
+    /// The image files.
+    pub images: &'a [SourceImage],
+    /// Measured positions, one an image.
+    pub positions: &'a [Option<Vector3<f64>>],
+    /// Pairs to match, as indices into `images`.
+    pub pairs: &'a [(usize, usize)],
+}
+
 /// Adds all jobs from image files to a model.
 ///
 /// # Errors
@@ -48,18 +59,18 @@ pub fn add_model(
     graph: &mut JobGraph<'_>,
     kind: ModelKind,
     name: &str,
-    images: &[SourceImage],
-    positions: &[Option<Vector3<f64>>],
+    source: ModelSource<'_>,
     config: &Config,
     seed: u64,
 ) -> Result<ModelJobs> {
+    let ModelSource { images, positions, pairs: chosen } = source;
     let params = match kind {
         ModelKind::Scene => config.features.clone(),
         ModelKind::Local => config.photo_features(),
     };
     let features = add_features_of(graph, images, &params);
     let mut pairs = Vec::new();
-    for (a, b) in choose_pairs(&config.pairs, positions) {
+    for &(a, b) in chosen {
         pairs.push((a, b, add_pair(graph, images, &features, (a, b), config, seed)?));
     }
     let cameras = share_cameras(images);
@@ -176,7 +187,8 @@ fn add_pair(
     config: &Config,
     seed: u64,
 ) -> Result<PairJobs> {
-    let name = format!("{} {}", images[a].name, images[b].name);
+    let name = [&images[a].name, &images[b].name];
+    let name = format!("{} {}", name[0].min(name[1]), name[0].max(name[1]));
     let (a, b) = if is_swapped(images, a, b) { (b, a) } else { (a, b) };
     let matching = config.matching.clone();
     let match_work = move |inputs: &Inputs<'_, '_>| {

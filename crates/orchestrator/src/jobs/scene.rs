@@ -7,7 +7,8 @@ use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
 use setloc_sfm::{MapperOutput, Reconstruction};
 
-use super::model::{ModelJobs, ModelKind, add_model, image_of_place_holder, with_names};
+use super::choose_pairs;
+use super::model::{ModelKind, ModelSource, add_model, image_of_place_holder, with_names};
 use crate::config::Config;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
@@ -18,8 +19,10 @@ use crate::stages;
 /// The jobs of a scene.
 #[derive(Debug, Clone)]
 pub struct SceneJobs {
-    /// Features and model.
-    pub model: ModelJobs,
+    /// One job an image, in the order of the images given.
+    pub features: Vec<JobId>,
+    /// The job whose result the model is.
+    pub model: JobId,
     /// The scene file.
     pub scene: JobId,
 }
@@ -35,9 +38,13 @@ pub fn add_scene(
     seed: u64,
 ) -> Result<SceneJobs> {
     let origin = origin_of(images);
-    let positions: Vec<Option<Vector3<f64>>> =
-        images.iter().map(|image| Some(image.position?.to_enu(origin?))).collect();
-    let jobs = add_model(graph, ModelKind::Scene, "scene", images, &positions, config, seed)?;
+    let position = |image: &SourceImage| Some(image.position?.to_enu(origin?));
+    let listed: Vec<Option<Vector3<f64>>> = images.iter().map(position).collect();
+    let (order, pairs) = by_content(images, &choose_pairs(&config.pairs, &listed));
+    let images: Vec<SourceImage> = order.iter().map(|&at| images[at].clone()).collect();
+    let positions: Vec<Option<Vector3<f64>>> = order.iter().map(|&at| listed[at]).collect();
+    let source = ModelSource { images: &images, positions: &positions, pairs: &pairs };
+    let jobs = add_model(graph, ModelKind::Scene, "scene", source, config, seed)?;
     let index_params = config.index.clone();
     let index_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
@@ -89,7 +96,27 @@ pub fn add_scene(
     });
     graph.require(scene, "model", jobs.model);
     graph.require(scene, "index", index);
-    Ok(SceneJobs { model: jobs, scene })
+    let mut features = jobs.features.clone();
+    for (&at, &job) in order.iter().zip(&jobs.features) {
+        features[at] = job;
+    }
+    Ok(SceneJobs { features, model: jobs.model, scene })
+}
+
+/// The images in the order of their content (their numbers in it), and the pairs as places in that order.
+///
+/// Whatever an image is called, the model gets the same input.
+fn by_content(images: &[SourceImage], pairs: &[(usize, usize)]) -> (Vec<usize>, Vec<(usize, usize)>) {
+    let mut order: Vec<usize> = (0..images.len()).collect();
+    order.sort_by_key(|&at| (images[at].hash, at));
+    let mut place = vec![0; images.len()];
+    for (rank, &at) in order.iter().enumerate() {
+        place[at] = rank;
+    }
+    let mut pairs: Vec<(usize, usize)> =
+        pairs.iter().map(|&(a, b)| (place[a].min(place[b]), place[a].max(place[b]))).collect();
+    pairs.sort_unstable();
+    (order, pairs)
 }
 
 /// The model with the images' names in place of the place holders.
