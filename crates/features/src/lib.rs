@@ -47,6 +47,7 @@ mod extract;
 mod features;
 mod mask;
 mod matching;
+mod patch;
 mod sift;
 
 pub use camera::{Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole, ProjectJacobian, UnprojectJacobian};
@@ -61,3 +62,4 @@ pub use mask::Mask;
 pub use matching::{
     DescriptorBlock, GuidedParams, Match, MatchParams, TwoNearest, match_features, match_guided, two_nearest,
 };
+pub use patch::{Aligned, ImagePyramid, Patch, PatchFrame, PatchParams, Template};
