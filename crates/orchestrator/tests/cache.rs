@@ -91,7 +91,18 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
     let folder = tempfile::tempdir().unwrap();
     town(folder.path());
     let first = build_and_locate(folder.path(), &Config::default());
-    let all = ["camset", "features", "index", "local_model", "matches", "model", "scene", "single", "verify"];
+    let all = [
+        "aligned",
+        "camset",
+        "features",
+        "index",
+        "local_model",
+        "matches",
+        "model",
+        "scene",
+        "single",
+        "verify",
+    ];
     assert_eq!(kinds(&first), BTreeSet::from(all));
     assert_eq!(build_and_locate(folder.path(), &Config::default()), [""; 0]);
     let after = |settings: &[&str]| {
@@ -103,7 +114,7 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
     let bundle = after(&["sfm.loss_sigma=1.5"]);
     assert_eq!(
         kinds(&bundle),
-        BTreeSet::from(["model", "local_model", "index", "scene", "single", "camset"])
+        BTreeSet::from(["model", "aligned", "local_model", "index", "scene", "single", "camset"])
     );
     let features = after(&["features.max_features=300"]);
     assert_eq!(kinds(&features), BTreeSet::from(all));
