@@ -41,9 +41,10 @@ pub struct AlignmentParams {
     pub max_shift_sigma: f64,
     /// Standard deviation in pixels that is added in square to what the patches state: their surfaces are no planes.
     pub noise_floor_px: f64,
-    /// Factor on the stated standard deviations, for the tails of real differences.
+    /// Factor on what the patches state, for the tails of real differences: as that of the keypoints' own.
     pub noise_factor: f64,
-    /// Scale of the Cauchy loss of the adjustment in standard deviations.
+    /// Scale of the Cauchy loss of the adjustment in standard deviations. These are stated twice as large as most
+    /// residuals are, so the loss bends at what is common.
     pub loss_sigma: f64,
     /// Most steps of the adjustment.
     pub max_iterations: u32,
@@ -59,7 +60,7 @@ impl Default for AlignmentParams {
             max_shift_sigma: 3.0,
             noise_floor_px: 0.03,
             noise_factor: 2.0,
-            loss_sigma: 1.0,
+            loss_sigma: 0.5,
             max_iterations: 50,
             patch: PatchParams::default(),
         }

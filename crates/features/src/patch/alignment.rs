@@ -301,14 +301,14 @@ mod tests {
         // The second image shows at p what the first shows at origin + A (p − middle).
         let map = Matrix2::new(1.12, 0.08, -0.1, 0.91);
         let second = pyramid([128, 128], false, |x, y| {
-            let q = Vector2::new(64.5, 64.5) + map * Vector2::new(x - 60.7, y - 66.2);
+            let q = Vector2::new(64.0, 64.0) + map * Vector2::new(x - 60.7, y - 66.2);
             0.8 * texture(q.x, q.y) + 15.0
         });
         let found =
-            template(&first, &frame(64.5, 64.5, 1.0)).unwrap().align(&second, &frame(62.0, 65.0, 1.0));
+            template(&first, &frame(64.0, 64.0, 1.0)).unwrap().align(&second, &frame(62.0, 65.0, 1.0));
         let found = found.unwrap();
-        assert!((found.pixel - Vector2::new(60.7, 66.2)).norm() < 0.03, "{found:?}");
-        assert!(found.correlation > 0.99 && found.noise_px < 0.1, "{found:?}");
+        assert!((found.pixel - Vector2::new(60.7, 66.2)).norm() < 0.05, "{found:?}");
+        assert!(found.correlation > 0.99 && found.noise_px < 0.02, "{found:?}");
     }
 
     #[test]
