@@ -12,6 +12,7 @@
 //! | features | [`extract`] | SIFT → RootSIFT bytes, closed over a panorama's seam, spread over the sphere |
 //! | rays | [`ImageFeatures::rays`] | unit bearings with angular standard deviations |
 //! | matches | [`match_features`], [`match_guided`] | exact two nearest neighbours; along epipolar circles once a pose is known |
+//! | patches | [`Template::align`] | one place in two images, to a fraction of a pixel |
 //!
 //! Conventions: camera frame x right, y down, z forward; the centre of the first pixel is (0.5, 0.5); radians inside,
 //! parameters in degrees or pixels say so in their names.

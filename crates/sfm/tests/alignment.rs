@@ -56,11 +56,11 @@ impl Room {
                 let rgb = pixels
                     .flat_map(|(x, y)| {
                         let pixel = Vector2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-                        let ray = pose.rotation * lens.unproject(&pixel).unwrap();
+                        let ray = pose.rotation * lens.unproject(&pixel).expect("a panorama sees everywhere");
                         [paint(&wall(&pose.translation, &ray)).round() as u8; 3]
                     })
                     .collect();
-                let image = DecodedImage::from_rgb(640, 320, rgb).unwrap();
+                let image = DecodedImage::from_rgb(640, 320, rgb).expect("as many bytes as pixels");
                 Arc::new(ImagePyramid::new(&image, camera.wraps_around()))
             })
             .collect();
@@ -73,7 +73,9 @@ impl Room {
                 if rng.random_bool(0.3) {
                     continue;
                 }
-                let pixel = camera.project(&pose.inverse_transform_point(&position)).unwrap();
+                let pixel = camera
+                    .project(&pose.inverse_transform_point(&position))
+                    .expect("a panorama sees everywhere");
                 let noisy = pixel + Vector2::new(normal(&mut rng), normal(&mut rng)) * NOISE_PX;
                 track.push(Observation { image: ImageId(image as u32), feature: features.len() as u32 });
                 features.keypoints.push(Keypoint {
@@ -117,9 +119,10 @@ impl Room {
     fn error(&self, model: &Reconstruction) -> f64 {
         let centers =
             |poses: &mut dyn Iterator<Item = Rigid>| poses.map(|p| p.translation).collect::<Vec<_>>();
-        let found = centers(&mut model.images.iter().map(|image| image.world_from_camera.unwrap()));
+        let found =
+            centers(&mut model.images.iter().map(|image| image.world_from_camera.expect("registered")));
         let truth = centers(&mut self.truth.iter().copied());
-        let aligned = Similarity::from_point_pairs(&found, &truth).unwrap();
+        let aligned = Similarity::from_point_pairs(&found, &truth).expect("four centres apart");
         let distance =
             |(found, truth): (&Vector3<f64>, &Vector3<f64>)| (aligned.transform_point(found) - truth).norm();
         found.iter().zip(&truth).map(distance).sum::<f64>() / truth.len() as f64
@@ -154,7 +157,8 @@ fn the_result_has_the_same_bytes_with_any_number_of_threads() {
 fn keypoints_without_their_surroundings_stay() {
     let mut room = Room::new("keypoints_without_their_surroundings_stay");
     let grey = DecodedImage::from_rgb(640, 320, vec![90; 640 * 320 * 3]).unwrap();
-    room.pyramids = vec![Arc::new(ImagePyramid::new(&grey, true)); 4];
+    let grey = Arc::new(ImagePyramid::new(&grey, true));
+    room.pyramids.fill(grey);
     let (model, report) = room.align(&AlignmentParams::default());
     let by_keypoints = AlignmentParams { max_shift_sigma: 0.0, ..AlignmentParams::default() };
     assert_eq!(report.aligned, 0);

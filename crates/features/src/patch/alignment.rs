@@ -154,7 +154,9 @@ impl Template {
             }
         }
         let sum: f32 = weights.iter().sum();
-        weights.iter_mut().for_each(|weight| *weight /= sum);
+        for weight in &mut weights {
+            *weight /= sum;
+        }
         let mut curvature = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::zeros();
         // For the covariance of a weighted fit: JᵀΩ²J.
         let mut spread = curvature;

@@ -21,9 +21,6 @@ const KEPT_BYTES: usize = 1 << 30;
 const WORKING_BYTES: u64 = 8;
 
 /// Adds the alignment of a model; `camera_fixed` says whose intrinsics are known, by the model's cameras.
-///
-/// # Errors
-/// When parameters have no JSON form.
 pub(super) fn add_alignment(
     graph: &mut JobGraph<'_>,
     images: &[SourceImage],
@@ -31,16 +28,16 @@ pub(super) fn add_alignment(
     model: JobId,
     camera_fixed: Vec<bool>,
     params: &AlignmentParams,
-) -> Result<JobId> {
+) -> JobId {
     let external =
         images.iter().enumerate().map(|(at, image)| (format!("image {at:04}"), image.hash)).collect();
     let pixels = images.iter().map(|image| u64::from(image.camera.width) * u64::from(image.camera.height));
     let largest = pixels.clone().max().unwrap_or(0);
     let memory = pixels.sum::<u64>().min(KEPT_BYTES as u64) + 2 * WORKING_BYTES * largest;
-    let sources = images.iter().map(|image| (image.path.clone(), image.hash)).collect();
+    let sources: Vec<(PathBuf, ContentHash)> =
+        images.iter().map(|image| (image.path.clone(), image.hash)).collect();
     let job_params = json!({ "alignment": params, "camera_fixed": camera_fixed });
     let params = params.clone();
-    let sources: Vec<(PathBuf, ContentHash)> = sources;
     let work = move |inputs: &Inputs<'_, '_>| run_alignment(inputs, &params, &camera_fixed, &sources);
     let aligned = graph.add(Job {
         kind: "aligned",
@@ -55,7 +52,7 @@ pub(super) fn add_alignment(
     for (at, used) in features.iter().enumerate() {
         graph.accept(aligned, features_role(at), *used);
     }
-    Ok(aligned)
+    aligned
 }
 
 fn run_alignment(
@@ -64,6 +61,7 @@ fn run_alignment(
     camera_fixed: &[bool],
     sources: &[(PathBuf, ContentHash)],
 ) -> Result<Product> {
+    params.patch.validate()?;
     let mut output = (*inputs.get::<MapperOutput>("model")?).clone();
     let Some(first) = output.components.first() else { return Product::new(output) };
     // All components list the same images.

@@ -101,7 +101,7 @@ pub fn add_model(
     }
     let model = match kind {
         ModelKind::Scene if config.alignment.enabled => {
-            add_alignment(graph, images, &features, model, fixed, &config.alignment)?
+            add_alignment(graph, images, &features, model, fixed, &config.alignment)
         }
         _ => model,
     };
