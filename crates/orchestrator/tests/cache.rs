@@ -189,7 +189,7 @@ fn a_changed_folder_of_panoramas_runs_exactly_what_follows() {
         let pair = |kind: &str, other: &String| format!("{kind} panoramas/{other} panoramas/{new}");
         let mut jobs = vec![format!("features panoramas/{new}")];
         jobs.extend(others.iter().flat_map(|other| [pair("matches", other), pair("verify", other)]));
-        jobs.extend(["model scene", "index scene", "scene scene"].map(str::to_owned));
+        jobs.extend(["model scene", "aligned scene", "index scene", "scene scene"].map(str::to_owned));
         jobs.sort();
         jobs
     };
@@ -197,7 +197,7 @@ fn a_changed_folder_of_panoramas_runs_exactly_what_follows() {
     assert_eq!(*added, pairs_of(last, others));
     assert_eq!(*replaced, pairs_of(last, others));
     assert_eq!(*renamed, ["scene scene"]);
-    assert_eq!(*removed, ["index scene", "model scene", "scene scene"]);
+    assert_eq!(*removed, ["aligned scene", "index scene", "model scene", "scene scene"]);
 }
 
 #[test]
