@@ -242,6 +242,12 @@ struct Candidate {
     is_light: bool,
 }
 
+/// Luma of ITU-R BT.601 of one RGB pixel, in 14-bit integers.
+pub(crate) fn luma(pixel: &[u8]) -> u8 {
+    let sum = 4899 * u32::from(pixel[0]) + 9617 * u32::from(pixel[1]) + 1868 * u32::from(pixel[2]);
+    ((sum + (1 << 13)) >> 14) as u8
+}
+
 /// A grey image for the detector.
 struct Grey {
     width: usize,
@@ -250,12 +256,7 @@ struct Grey {
 }
 
 impl Grey {
-    /// Luma of ITU-R BT.601 in 14-bit integers.
     fn new(image: &DecodedImage) -> Self {
-        let luma = |pixel: &[u8]| {
-            let sum = 4899 * u32::from(pixel[0]) + 9617 * u32::from(pixel[1]) + 1868 * u32::from(pixel[2]);
-            ((sum + (1 << 13)) >> 14) as u8
-        };
         let values = image.rgb.chunks_exact(3).map(luma).collect();
         Self { width: image.width as usize, height: image.height as usize, values }
     }

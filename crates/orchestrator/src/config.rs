@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 use setloc_camset::{CamsetParams, SingleParams};
 use setloc_index::IndexParams;
-use setloc_sfm::{GeoregisterParams, MapperParams, QualityParams, TwoViewParams};
+use setloc_sfm::{AlignmentParams, GeoregisterParams, MapperParams, QualityParams, TwoViewParams};
 
 use crate::error::Hinted;
 use crate::stages::{FeatureParams, MatchParams};
@@ -27,6 +27,8 @@ pub struct Config {
     pub two_view: TwoViewParams,
     /// Mapping of the scene and of local models.
     pub sfm: MapperParams,
+    /// Alignment of a scene's tracks by its images.
+    pub alignment: AlignmentParams,
     /// What the quality gate speaks up about.
     pub quality: QualityParams,
     /// Alignment to measured positions.

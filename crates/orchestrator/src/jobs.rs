@@ -1,5 +1,6 @@
 //! The job kinds and how they depend on each other.
 
+mod alignment;
 mod locate;
 mod model;
 mod pairs;

@@ -6,8 +6,8 @@ use anyhow::Result;
 use setloc_town::TownParams;
 
 pub use setloc_features::{
-    DecodeLimits, DecodedImage, FeatureParams, ImageInfo, Mask, MatchParams, decode, extract, guess_camera,
-    match_features, probe,
+    DecodeLimits, DecodedImage, FeatureParams, ImageInfo, ImagePyramid, Mask, MatchParams, decode, extract,
+    guess_camera, match_features, probe,
 };
 
 /// Version of decoding and extraction; part of the fingerprint of `features` jobs.
@@ -18,6 +18,8 @@ pub const MATCHING_VERSION: u32 = MatchParams::VERSION;
 pub const VERIFY_VERSION: u32 = setloc_sfm::TWO_VIEW_VERSION;
 /// Version of mapping.
 pub const MAPPER_VERSION: u32 = setloc_sfm::MAPPER_VERSION;
+/// Version of the alignment of tracks.
+pub const ALIGNMENT_VERSION: u32 = setloc_sfm::ALIGNMENT_VERSION;
 /// Version of indexing.
 pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// Version of the scene file's making.

@@ -91,7 +91,18 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
     let folder = tempfile::tempdir().unwrap();
     town(folder.path());
     let first = build_and_locate(folder.path(), &Config::default());
-    let all = ["camset", "features", "index", "local_model", "matches", "model", "scene", "single", "verify"];
+    let all = [
+        "aligned",
+        "camset",
+        "features",
+        "index",
+        "local_model",
+        "matches",
+        "model",
+        "scene",
+        "single",
+        "verify",
+    ];
     assert_eq!(kinds(&first), BTreeSet::from(all));
     assert_eq!(build_and_locate(folder.path(), &Config::default()), [""; 0]);
     let after = |settings: &[&str]| {
@@ -103,7 +114,7 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
     let bundle = after(&["sfm.loss_sigma=1.5"]);
     assert_eq!(
         kinds(&bundle),
-        BTreeSet::from(["model", "local_model", "index", "scene", "single", "camset"])
+        BTreeSet::from(["model", "aligned", "local_model", "index", "scene", "single", "camset"])
     );
     let features = after(&["features.max_features=300"]);
     assert_eq!(kinds(&features), BTreeSet::from(all));
@@ -180,7 +191,7 @@ fn a_changed_folder_of_panoramas_runs_exactly_what_follows() {
         let pair = |kind: &str, other: &String| format!("{kind} panoramas/{other} panoramas/{new}");
         let mut jobs = vec![format!("features panoramas/{new}")];
         jobs.extend(others.iter().flat_map(|other| [pair("matches", other), pair("verify", other)]));
-        jobs.extend(["model scene", "index scene", "scene scene"].map(str::to_owned));
+        jobs.extend(["model scene", "aligned scene", "index scene", "scene scene"].map(str::to_owned));
         jobs.sort();
         jobs
     };
@@ -188,7 +199,7 @@ fn a_changed_folder_of_panoramas_runs_exactly_what_follows() {
     assert_eq!(*added, pairs_of(last, others));
     assert_eq!(*replaced, pairs_of(last, others));
     assert_eq!(*renamed, ["scene scene"]);
-    assert_eq!(*removed, ["index scene", "model scene", "scene scene"]);
+    assert_eq!(*removed, ["aligned scene", "index scene", "model scene", "scene scene"]);
 }
 
 #[test]

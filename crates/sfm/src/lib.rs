@@ -1,9 +1,11 @@
 //! Structure from motion on the sphere.
 //!
 //! Two-view geometry, triangulation, absolute and generalized pose, robust estimation, sparse bundle adjustment and
-//! the incremental mapper, all on unit rays: no pixel, no image plane and no seam exists here. The same code builds
-//! the scene from panoramas and the local model from the photos of a set.
+//! the incremental mapper, all on unit rays: no pixel, no image plane and no seam exists here, but for [`align_tracks`],
+//! which goes back to the images. The same code builds the scene from panoramas and the local model from the photos of
+//! a set.
 
+mod alignment;
 pub mod bundle;
 mod geometry;
 mod georegister;
@@ -16,6 +18,7 @@ pub mod synthetic;
 mod two_view;
 mod visibility;
 
+pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, align_tracks};
 pub use geometry::{Rigid, Similarity};
 pub use georegister::{GeoregisterParams, Georegistration, georegister};
 pub use mapper::{

@@ -15,6 +15,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, ImageFeatures, Match};
 
+pub(crate) use self::adjust::MIN_ADJUSTABLE_POINTS;
 pub use self::standpoint::Mosaic;
 
 use self::{

@@ -14,6 +14,7 @@ use setloc_sfm::{
     verify_pair,
 };
 
+use super::alignment::add_alignment;
 use super::derived_seed;
 use crate::artifacts::{PairMatches, VerifiedPair};
 use crate::config::Config;
@@ -36,7 +37,7 @@ pub enum ModelKind {
 pub struct ModelJobs {
     /// One job an image.
     pub features: Vec<JobId>,
-    /// The mapping job.
+    /// The job whose result the model is.
     pub model: JobId,
 }
 
@@ -79,6 +80,7 @@ pub fn add_model(
     let params = json!({
         "sfm": config.sfm, "two_view": config.two_view, "quality": config.quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "camera_fixed": cameras.fixed,
     });
+    let fixed = cameras.fixed.clone();
     let stage = ModelConfig {
         mapper: config.sfm.clone(),
         two_view: config.two_view.clone(),
@@ -108,6 +110,12 @@ pub fn add_model(
         graph.accept(model, pair_role(a, b), used.verified);
         graph.accept(model, matches_role(a, b), used.matches);
     }
+    let model = match kind {
+        ModelKind::Scene if config.alignment.enabled => {
+            add_alignment(graph, images, &features, model, fixed, &config.alignment)
+        }
+        _ => model,
+    };
     Ok(ModelJobs { features, model })
 }
 
@@ -120,7 +128,7 @@ pub fn add_features_of(
     images.iter().map(|image| add_features(graph, image, params)).collect()
 }
 
-fn features_role(at: usize) -> String {
+pub(super) fn features_role(at: usize) -> String {
     format!("features {at:04}")
 }
 
@@ -165,7 +173,7 @@ fn read_mask(path: &Path, hash: ContentHash) -> Result<stages::Mask> {
 }
 
 /// The bytes that were hashed when the run was planned.
-fn read_unchanged(path: &Path, hash: ContentHash) -> Result<Vec<u8>> {
+pub(super) fn read_unchanged(path: &Path, hash: ContentHash) -> Result<Vec<u8>> {
     let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
     anyhow::ensure!(ContentHash::of(&bytes) == hash, "{} changed while it was used", path.display());
     Ok(bytes)

@@ -8,8 +8,18 @@ use crate::graph::{Event, Observer};
 use crate::print;
 
 /// Stages in the order they are shown.
-const STAGES: [&str; 9] =
-    ["features", "matches", "verify", "model", "local_model", "index", "scene", "single", "camset"];
+const STAGES: [&str; 10] = [
+    "features",
+    "matches",
+    "verify",
+    "model",
+    "aligned",
+    "local_model",
+    "index",
+    "scene",
+    "single",
+    "camset",
+];
 
 /// Bars with rate and remaining time on a terminal, plain lines elsewhere; all on standard error.
 pub struct Console {

@@ -48,7 +48,7 @@ impl Scope {
 }
 
 /// Points that an image must see for its pose to be adjusted.
-const MIN_ADJUSTABLE_POINTS: usize = 12;
+pub(crate) const MIN_ADJUSTABLE_POINTS: usize = 12;
 
 /// Whether an image sees enough points for its own pose.
 pub(super) fn is_adjustable(model: &Model<'_>, image: ImageId) -> bool {

@@ -1,0 +1,119 @@
+//! The alignment of a scene's tracks by its images.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use anyhow::{Context, Result};
+use serde_json::json;
+use setloc_features::ImageFeatures;
+use setloc_sfm::{AlignmentParams, MapperOutput, align_tracks};
+
+use super::model::{features_role, image_of_place_holder, read_unchanged};
+use crate::dataset::SourceImage;
+use crate::fingerprint::ContentHash;
+use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
+use crate::stages;
+
+/// Bytes of grey images that are kept between cutting patches and finding them; further images are decoded twice.
+const KEPT_BYTES: usize = 1 << 30;
+/// Bytes a pixel of an image in work: decoded, grey and reduced.
+const WORKING_BYTES: u64 = 8;
+
+/// Adds the alignment of a model; `camera_fixed` says whose intrinsics are known, by the model's cameras.
+pub(super) fn add_alignment(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    features: &[JobId],
+    model: JobId,
+    camera_fixed: Vec<bool>,
+    params: &AlignmentParams,
+) -> JobId {
+    let external =
+        images.iter().enumerate().map(|(at, image)| (format!("image {at:04}"), image.hash)).collect();
+    let pixels = images.iter().map(|image| u64::from(image.camera.width) * u64::from(image.camera.height));
+    let largest = pixels.clone().max().unwrap_or(0);
+    let memory = pixels.sum::<u64>().min(KEPT_BYTES as u64) + 2 * WORKING_BYTES * largest;
+    let sources: Vec<(PathBuf, ContentHash)> =
+        images.iter().map(|image| (image.path.clone(), image.hash)).collect();
+    let job_params = json!({ "alignment": params, "camera_fixed": camera_fixed });
+    let params = params.clone();
+    let work = move |inputs: &Inputs<'_, '_>| run_alignment(inputs, &params, &camera_fixed, &sources);
+    let aligned = graph.add(Job {
+        kind: "aligned",
+        version: stages::ALIGNMENT_VERSION,
+        name: graph.job(model).name.clone(),
+        params: job_params,
+        external,
+        memory,
+        work: Box::new(work),
+    });
+    graph.require(aligned, "model", model);
+    for (at, used) in features.iter().enumerate() {
+        graph.accept(aligned, features_role(at), *used);
+    }
+    aligned
+}
+
+fn run_alignment(
+    inputs: &Inputs<'_, '_>,
+    params: &AlignmentParams,
+    camera_fixed: &[bool],
+    sources: &[(PathBuf, ContentHash)],
+) -> Result<Product> {
+    params.patch.validate()?;
+    let mut output = (*inputs.get::<MapperOutput>("model")?).clone();
+    let Some(first) = output.components.first() else { return Product::new(output) };
+    // All components list the same images.
+    let mut image_at = Vec::new();
+    for image in &first.images {
+        let at = image_of_place_holder(&image.name).filter(|at| *at < sources.len());
+        image_at.push(at.with_context(|| format!("the model names an unknown image {}", image.name))?);
+    }
+    let mut features = Vec::new();
+    for at in &image_at {
+        features.push(inputs.get::<ImageFeatures>(&features_role(*at))?);
+    }
+    let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
+    for component in &mut output.components {
+        let wraps: Vec<bool> = component
+            .images
+            .iter()
+            .map(|image| component.cameras[image.camera.index()].wraps_around())
+            .collect();
+        let pyramids = Pyramids::default();
+        let report = align_tracks(params, component, &features, camera_fixed, |image| {
+            pyramids.get(&sources[image_at[image.index()]], wraps[image.index()])
+        })?;
+        if report.aligned * 5 < report.sought {
+            output.report.warnings.push(format!(
+                "the pixels round only {} of {} matched keypoints agree",
+                report.aligned, report.sought
+            ));
+        }
+    }
+    Product::new(output)
+}
+
+/// Grey images in memory, as many as fit.
+#[derive(Default)]
+struct Pyramids {
+    kept: Mutex<(usize, BTreeMap<PathBuf, Arc<stages::ImagePyramid>>)>,
+}
+
+impl Pyramids {
+    fn get(&self, (path, hash): &(PathBuf, ContentHash), wraps: bool) -> Result<Arc<stages::ImagePyramid>> {
+        if let Some(found) = self.kept.lock().unwrap_or_else(PoisonError::into_inner).1.get(path) {
+            return Ok(Arc::clone(found));
+        }
+        let bytes = read_unchanged(path, *hash)?;
+        let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
+        let pyramid = Arc::new(stages::ImagePyramid::new(&decoded, wraps));
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        if kept.0 + pyramid.byte_size() <= KEPT_BYTES {
+            kept.0 += pyramid.byte_size();
+            kept.1.insert(path.clone(), Arc::clone(&pyramid));
+        }
+        Ok(pyramid)
+    }
+}

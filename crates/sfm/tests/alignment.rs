@@ -1,0 +1,180 @@
+//! Alignment of tracks in a rendered room of exact truth.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+
+use nalgebra::{UnitQuaternion, Vector2, Vector3};
+use rand::Rng;
+use setloc_features::{Camera, DecodedImage, ImageFeatures, ImagePyramid, Keypoint};
+use setloc_sfm::synthetic::{normal, normal_vector, random_rotation, random_unit, seeded};
+use setloc_sfm::{
+    AlignmentParams, AlignmentReport, CameraId, ImageId, Observation, Reconstruction, ReconstructionImage,
+    ReconstructionPoint, Rigid, Similarity, align_tracks,
+};
+
+/// Half of the room's extents in metres.
+const ROOM: [f64; 3] = [5.0, 3.0, 4.0];
+/// Standard deviation of the keypoints in pixels.
+const NOISE_PX: f64 = 0.4;
+
+/// A room, panoramas of it turned any way, and what a mapper would have made of noisy keypoints.
+struct Room {
+    truth: Vec<Rigid>,
+    features: Vec<ImageFeatures>,
+    pyramids: Vec<Arc<ImagePyramid>>,
+    model: Reconstruction,
+}
+
+/// Where a ray from inside meets the walls.
+fn wall(origin: &Vector3<f64>, direction: &Vector3<f64>) -> Vector3<f64> {
+    let reach = |axis: usize| (ROOM[axis] * direction[axis].signum() - origin[axis]) / direction[axis];
+    let distance = (0..3).map(reach).filter(|reach| reach.is_finite()).fold(f64::INFINITY, f64::min);
+    origin + direction * distance
+}
+
+/// What is painted on the walls.
+fn paint(place: &Vector3<f64>) -> f64 {
+    let waves = [(7.1, 2.3, -4.2), (-3.3, 6.4, 5.1), (4.7, -5.9, 6.8), (-8.3, -1.7, 3.9), (1.9, 8.8, -7.3)];
+    120.0 + 20.0 * waves.iter().map(|(a, b, c)| (a * place.x + b * place.y + c * place.z).sin()).sum::<f64>()
+}
+
+impl Room {
+    fn new(name: &str) -> Self {
+        let mut rng = seeded(name);
+        let camera = Camera::equirectangular(640, 320);
+        let truth: Vec<Rigid> = (0..4)
+            .map(|k| {
+                let center = Vector3::new(f64::from(k) - 1.5, 0.2 * normal(&mut rng), 0.5 * normal(&mut rng));
+                Rigid::new(random_rotation(&mut rng), center)
+            })
+            .collect();
+        let lens = Camera::equirectangular(640, 320);
+        let pyramids = truth
+            .iter()
+            .map(|pose| {
+                let pixels = (0..320).flat_map(|y| (0..640).map(move |x| (x, y)));
+                let rgb = pixels
+                    .flat_map(|(x, y)| {
+                        let pixel = Vector2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+                        let ray = pose.rotation * lens.unproject(&pixel).expect("a panorama sees everywhere");
+                        [paint(&wall(&pose.translation, &ray)).round() as u8; 3]
+                    })
+                    .collect();
+                let image = DecodedImage::from_rgb(640, 320, rgb).expect("as many bytes as pixels");
+                Arc::new(ImagePyramid::new(&image, camera.wraps_around()))
+            })
+            .collect();
+        let mut features = vec![ImageFeatures { width: 640, height: 320, ..ImageFeatures::default() }; 4];
+        let mut points = Vec::new();
+        for _ in 0..400 {
+            let position = wall(&Vector3::zeros(), &random_unit(&mut rng));
+            let mut track = Vec::new();
+            for (image, (pose, features)) in truth.iter().zip(&mut features).enumerate() {
+                if rng.random_bool(0.3) {
+                    continue;
+                }
+                let pixel = camera
+                    .project(&pose.inverse_transform_point(&position))
+                    .expect("a panorama sees everywhere");
+                let noisy = pixel + Vector2::new(normal(&mut rng), normal(&mut rng)) * NOISE_PX;
+                track.push(Observation { image: ImageId(image as u32), feature: features.len() as u32 });
+                features.keypoints.push(Keypoint {
+                    x: noisy.x as f32,
+                    y: noisy.y as f32,
+                    size: 3.0,
+                    orientation: 0.0,
+                    noise_px: 2.0 * NOISE_PX as f32,
+                });
+            }
+            if track.len() >= 2 {
+                let position = position + normal_vector(&mut rng) * 0.02;
+                points.push(ReconstructionPoint { position, color: [0; 3], error_sigma: 0.0, track });
+            }
+        }
+        let images = truth
+            .iter()
+            .enumerate()
+            .map(|(index, pose)| {
+                let turn = UnitQuaternion::from_scaled_axis(normal_vector(&mut rng) * 1e-3);
+                let moved = pose.translation + normal_vector(&mut rng) * 5e-3;
+                ReconstructionImage {
+                    name: index.to_string(),
+                    camera: CameraId(0),
+                    world_from_camera: Some(Rigid::new(pose.rotation * turn, moved)),
+                }
+            })
+            .collect();
+        let model = Reconstruction { cameras: vec![camera], images, points };
+        Self { truth, features, pyramids, model }
+    }
+
+    fn align(&self, params: &AlignmentParams) -> (Reconstruction, AlignmentReport) {
+        let (mut model, features) = (self.model.clone(), self.features.iter().collect::<Vec<_>>());
+        let load = |image: ImageId| Ok::<_, Infallible>(Arc::clone(&self.pyramids[image.index()]));
+        let report = align_tracks(params, &mut model, &features, &[true], load).unwrap();
+        (model, report)
+    }
+
+    /// Mean distance of the centres from the truth after the best similarity, in metres.
+    fn error(&self, model: &Reconstruction) -> f64 {
+        let centers =
+            |poses: &mut dyn Iterator<Item = Rigid>| poses.map(|p| p.translation).collect::<Vec<_>>();
+        let found =
+            centers(&mut model.images.iter().map(|image| image.world_from_camera.expect("registered")));
+        let truth = centers(&mut self.truth.iter().copied());
+        let aligned = Similarity::from_point_pairs(&found, &truth).expect("four centres apart");
+        let distance =
+            |(found, truth): (&Vector3<f64>, &Vector3<f64>)| (aligned.transform_point(found) - truth).norm();
+        found.iter().zip(&truth).map(distance).sum::<f64>() / truth.len() as f64
+    }
+}
+
+#[test]
+fn pixels_place_the_cameras_better_than_keypoints() {
+    let room = Room::new("pixels_place_the_cameras_better_than_keypoints");
+    // With no shift allowed every keypoint stays where it was detected.
+    let by_keypoints = AlignmentParams { max_shift_sigma: 0.0, ..AlignmentParams::default() };
+    let (keypoints, none) = room.align(&by_keypoints);
+    let (pixels, report) = room.align(&AlignmentParams::default());
+    assert_eq!(none.aligned, 0);
+    assert!(report.aligned * 2 > report.sought, "{report:?}");
+    let (before, after) = (room.error(&keypoints), room.error(&pixels));
+    assert!(after < before / 3.0, "{before} {after}");
+    assert_eq!(pixels.points[0].track, room.model.points[0].track);
+}
+
+#[test]
+fn the_result_has_the_same_bytes_with_any_number_of_threads() {
+    let room = Room::new("the_result_has_the_same_bytes_with_any_number_of_threads");
+    let with = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| room.align(&AlignmentParams::default()).0)
+    };
+    assert_eq!(with(1), with(3));
+}
+
+#[test]
+fn keypoints_without_their_surroundings_stay() {
+    let mut room = Room::new("keypoints_without_their_surroundings_stay");
+    let grey = DecodedImage::from_rgb(640, 320, vec![90; 640 * 320 * 3]).unwrap();
+    let grey = Arc::new(ImagePyramid::new(&grey, true));
+    room.pyramids.fill(grey);
+    let (model, report) = room.align(&AlignmentParams::default());
+    let by_keypoints = AlignmentParams { max_shift_sigma: 0.0, ..AlignmentParams::default() };
+    assert_eq!(report.aligned, 0);
+    assert_eq!(model, room.align(&by_keypoints).0);
+}
+
+#[test]
+fn photos_of_one_standpoint_and_unreadable_images_leave_the_model_alone() {
+    let mut room = Room::new("photos_of_one_standpoint_and_unreadable_images_leave_the_model_alone");
+    let features = room.features.clone();
+    let features: Vec<&ImageFeatures> = features.iter().collect();
+    let mut model = room.model.clone();
+    let load = |image: ImageId| if image.0 == 2 { Err("gone") } else { Ok(Arc::clone(&room.pyramids[0])) };
+    let failed = align_tracks(&AlignmentParams::default(), &mut model, &features, &[true], load);
+    assert_eq!((failed, &model), (Err("gone"), &room.model));
+    let center = room.model.images[0].world_from_camera.unwrap().translation;
+    room.model.images[3].world_from_camera.as_mut().unwrap().translation = center;
+    assert_eq!(room.align(&AlignmentParams::default()), (room.model.clone(), AlignmentReport::default()));
+}
