@@ -24,4 +24,4 @@ pub use scene_index::{Row, SceneIndex};
 /// Version of the index's contents; bumped whenever equal inputs give another index.
 ///
 /// 1: exact, inverted lists, kd-tree over eight principal components.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;

@@ -214,6 +214,7 @@ mod tests {
                 position,
                 color: [0; 3],
                 error_sigma: 1.0,
+                covariance: None,
                 track,
             });
             truth.push(center);

@@ -78,7 +78,13 @@ impl SceneIndex {
         }
         let mut index = Self {
             positions: reconstruction.points.iter().map(|point| point.position).collect(),
-            covariances: information.iter().map(position_covariance).collect(),
+            covariances: information
+                .iter()
+                .zip(&reconstruction.points)
+                .map(|(information, point)| {
+                    point.covariance.unwrap_or_else(|| position_covariance(information))
+                })
+                .collect(),
             centers: reconstruction
                 .images
                 .iter()

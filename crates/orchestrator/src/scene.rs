@@ -30,7 +30,7 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 2);
+serde_artifact!(SceneFile, "scene", 3);
 
 impl SceneFile {
     /// Reads a scene file.

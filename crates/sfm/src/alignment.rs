@@ -6,15 +6,23 @@
 //! with the shape that a plane facing the viewers would have there. Then everything is adjusted once more, each
 //! observation with its own standard deviation.
 //!
+//! Two things keep the places free of bias, which all along a street would add up. A first alignment tells how the
+//! surfaces are slanted ([`slope`]), and patches are then cut and sought as that surface bends in perspective (and in a
+//! panorama), not as an affine map has it. And after the adjustment patches are sought in all other views that
+//! see their place, keypoint or not, so that few points hang on two views alone.
+//!
 //! Tracks, features and points stay what they are; poses, points and free intrinsics move.
 
 use std::cmp::Ordering;
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use nalgebra::{Matrix2, Matrix3x2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, Vector2, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use setloc_features::{Aligned, ImageFeatures, ImagePyramid, Patch, PatchFrame, PatchParams, Rays, Template};
+use setloc_features::{
+    Aligned, ImageFeatures, ImagePyramid, Keypoint, Patch, PatchFrame, PatchParams, Rays, Template,
+};
 
 use crate::{
     ImageId, Observation, Reconstruction, Rigid,
@@ -27,7 +35,17 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 1;
+pub const ALIGNMENT_VERSION: u32 = 3;
+
+/// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
+const MIN_COSINE: f64 = 0.5;
+/// Largest factor between the resolutions of a patch in its reference and where it is sought without a keypoint.
+const MAX_ZOOM: f64 = 2.0;
+
+/// Standard deviation of the entries of the linear map between two patches, which noise and relief leave.
+const SHAPE_SIGMA: f64 = 0.05;
+/// Largest slope of a surface over the plane that faces its viewers.
+const MAX_SLOPE: f64 = 3.0;
 
 /// How the observations of a track are aligned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -61,7 +79,7 @@ impl Default for AlignmentParams {
             noise_floor_px: 0.03,
             noise_factor: 2.0,
             loss_sigma: 0.5,
-            max_iterations: 50,
+            max_iterations: 200,
             patch: PatchParams::default(),
         }
     }
@@ -76,12 +94,14 @@ pub struct AlignmentReport {
     pub sought: usize,
     /// Those that were found.
     pub aligned: usize,
+    /// Patches found in views whose keypoints do not belong to the track.
+    pub further: usize,
 }
 
 /// Aligns the tracks of a component and adjusts it.
 ///
 /// `features` are those of the component's images, by id; `camera_fixed` says whose intrinsics are known. `load` gives
-/// the pixels of a registered image and may be called twice for each, from several threads.
+/// the pixels of a registered image and may be called five times for each, from several threads.
 ///
 /// A component in which photos share a standpoint is left as it is: what ties their centres together is not known here.
 ///
@@ -98,30 +118,13 @@ pub fn align_tracks<E: Send>(
     if shares_standpoints(component, &registered) {
         return Ok(AlignmentReport::default());
     }
-    let tracks = Tracks::new(params, component, features);
-    let cut: Vec<Vec<(usize, Patch)>> = registered
-        .par_iter()
-        .map(|&image| Ok(tracks.cut(image, &*load(image)?)))
-        .collect::<Vec<Result<_, E>>>()
-        .into_iter()
-        .collect::<Result<_, E>>()?;
-    let mut patches: Vec<Option<Patch>> = vec![None; component.points.len()];
-    for (point, patch) in cut.into_iter().flatten() {
-        patches[point] = Some(patch);
-    }
-    let found: Vec<Vec<(usize, usize, Aligned)>> = registered
-        .par_iter()
-        .map(|&image| Ok(tracks.align(image, &*load(image)?, &patches)))
-        .collect::<Vec<Result<_, E>>>()
-        .into_iter()
-        .collect::<Result<_, E>>()?;
-    let mut aligned: Vec<Vec<Option<Aligned>>> =
-        component.points.iter().map(|point| vec![None; point.track.len()]).collect();
-    let mut report = AlignmentReport::default();
-    for (point, at, place) in found.into_iter().flatten() {
-        aligned[point][at] = Some(place);
-        report.aligned += 1;
-    }
+    let mut tracks = Tracks::new(params, component, features);
+    // The first alignment tells the slant of the surfaces, the second goes by it.
+    let (_, facing) = tracks.align_all(&registered, &load)?;
+    tracks.planes = tracks.tilted_planes(&facing);
+    let (patches, aligned) = tracks.align_all(&registered, &load)?;
+    let mut report =
+        AlignmentReport { aligned: aligned.iter().flatten().flatten().count(), ..AlignmentReport::default() };
     report.points = aligned.iter().filter(|track| track.iter().any(Option::is_some)).count();
     report.sought = patches
         .iter()
@@ -129,14 +132,34 @@ pub fn align_tracks<E: Send>(
         .filter(|(patch, _)| patch.is_some())
         .map(|(_, point)| point.track.len() - 1)
         .sum();
-    let mut problem = tracks.problem(camera_fixed, &aligned);
     let bundle = BundleParams {
         loss: RobustLoss::Cauchy(params.loss_sigma),
         max_iterations: params.max_iterations,
         ..BundleParams::default()
     };
+    let mut problem = tracks.problem(camera_fixed, &aligned, &[]);
     bundle::solve(&bundle, &mut problem);
+    let (references, planes) = (tracks.references, tracks.planes);
     store(component, features, &problem);
+    // Now it is known where the patches lie in views that no keypoint ties to them.
+    let tracks = Tracks { planes, references, ..Tracks::new(params, component, features) };
+    let middles: Vec<Option<Middle>> =
+        aligned.iter().enumerate().map(|(point, aligned)| tracks.middle(point, aligned)).collect();
+    let further: Vec<Vec<Further>> = registered
+        .par_iter()
+        .map(|&image| Ok(tracks.seek_further(image, &*load(image)?, &patches, &middles)))
+        .collect::<Vec<Result<_, E>>>()
+        .into_iter()
+        .collect::<Result<_, E>>()?;
+    let further = further.concat();
+    report.further = further.len();
+    let mut problem = tracks.problem(camera_fixed, &aligned, &further);
+    bundle::solve(&bundle, &mut problem);
+    let covariances = tracks.covariances(&aligned, &further);
+    store(component, features, &problem);
+    for (point, covariance) in component.points.iter_mut().zip(covariances) {
+        point.covariance = covariance;
+    }
     Ok(report)
 }
 
@@ -151,6 +174,9 @@ fn shares_standpoints(component: &Reconstruction, registered: &[ImageId]) -> boo
     });
     centers.windows(2).any(|pair| pair[0] == pair[1])
 }
+
+/// Patches by point, and where the views show them by point and place in the track.
+type AlignedTracks = (Vec<Option<Patch>>, Vec<Vec<Option<Aligned>>>);
 
 /// A component with what is asked of its tracks.
 struct Tracks<'a> {
@@ -198,12 +224,7 @@ impl<'a> Tracks<'a> {
 
     /// Pixels that a step along the plane of a point spans in a view, where it is seen at all.
     fn pixel_from_plane(&self, point: usize, image: ImageId) -> Option<Matrix2<f64>> {
-        let pose = self.component.images[image.index()].world_from_camera?;
-        let camera_from_world = pose.inverse();
-        let in_camera = camera_from_world.transform_point(&self.component.points[point].position);
-        let projected = self.component.camera_of(image).project_with_jacobian(&in_camera)?;
-        let rotation = camera_from_world.rotation.to_rotation_matrix();
-        Some(projected.d_direction * rotation.matrix() * self.planes[point])
+        Some(self.pixel_from_world(point, image)? * self.planes[point])
     }
 
     /// Length along the plane between two samples of a point's patch.
@@ -218,8 +239,96 @@ impl<'a> Tracks<'a> {
     fn frame(&self, point: usize, observation: Observation) -> Option<PatchFrame> {
         let pixel_from_plane = self.pixel_from_plane(point, observation.image)?;
         let keypoint = &self.features[observation.image.index()].keypoints[observation.feature as usize];
-        let pixel_from_patch = pixel_from_plane * self.spacing(point)?;
-        Some(PatchFrame { center: keypoint.pixel(), pixel_from_patch })
+        self.frame_at(point, observation.image, keypoint.pixel(), &pixel_from_plane)
+    }
+
+    /// The patch of a point in a view, with the curvature that its plane has there.
+    fn frame_at(
+        &self,
+        point: usize,
+        image: ImageId,
+        center: Vector2<f64>,
+        pixel_from_plane: &Matrix2<f64>,
+    ) -> Option<PatchFrame> {
+        let spacing = self.spacing(point)?;
+        let camera = self.component.camera_of(image);
+        let camera_from_world = self.component.images[image.index()].world_from_camera?.inverse();
+        let position = self.component.points[point].position;
+        let place = |x: f64, y: f64| {
+            let on_plane = self.planes[point] * Vector2::new(x, y) * spacing;
+            camera.project(&camera_from_world.transform_point(&(position + on_plane)))
+        };
+        let middle = place(0.0, 0.0)?;
+        let width = f64::from(camera.width);
+        let from_middle = |x: f64, y: f64| {
+            let mut offset = place(x, y)? - middle;
+            if camera.is_panoramic() {
+                offset.x -= width * (offset.x / width).round();
+            }
+            Some(offset)
+        };
+        let h = 0.5 * self.params.patch.radius as f64;
+        let along_x = from_middle(h, 0.0)? + from_middle(-h, 0.0)?;
+        let along_y = from_middle(0.0, h)? + from_middle(0.0, -h)?;
+        let mixed = 0.5 * (from_middle(h, h)? + from_middle(-h, -h)? - along_x - along_y);
+        let curvature =
+            [0, 1].map(|axis| Matrix2::new(along_x[axis], mixed[axis], mixed[axis], along_y[axis]) / (h * h));
+        Some(PatchFrame { center, pixel_from_patch: pixel_from_plane * spacing, curvature })
+    }
+
+    /// Planes through the points as the shapes of their patches in the views tell; see [`slope`].
+    fn tilted_planes(&self, aligned: &[Vec<Option<Aligned>>]) -> Vec<Matrix3x2<f64>> {
+        let tilted = |(point, aligned): (usize, &Vec<Option<Aligned>>)| {
+            let plane = &self.planes[point];
+            let normal: Vector3<f64> = plane.column(0).cross(&plane.column(1));
+            let track = &self.component.points[point].track;
+            let reference = self.pixel_from_world(point, track[self.references[point]].image)?;
+            let views = track.iter().zip(aligned).filter_map(|(seen, aligned)| {
+                Some((self.pixel_from_world(point, seen.image)?, aligned.as_ref()?.shape))
+            });
+            let slope = slope(plane, &normal, &reference, views)?;
+            let (u, v) = tangent_basis(&(normal - plane * slope).try_normalize(0.0)?);
+            Some(Matrix3x2::from_columns(&[u, v]))
+        };
+        aligned.iter().enumerate().map(|entry| tilted(entry).unwrap_or(self.planes[entry.0])).collect()
+    }
+
+    /// Pixels that a step of a point spans in a view.
+    fn pixel_from_world(&self, point: usize, image: ImageId) -> Option<Matrix2x3<f64>> {
+        let camera_from_world = self.component.images[image.index()].world_from_camera?.inverse();
+        let in_camera = camera_from_world.transform_point(&self.component.points[point].position);
+        let projected = self.component.camera_of(image).project_with_jacobian(&in_camera)?;
+        Some(projected.d_direction * camera_from_world.rotation.to_rotation_matrix().matrix())
+    }
+
+    /// The patches of all points and where their other views show them.
+    fn align_all<E: Send>(
+        &self,
+        registered: &[ImageId],
+        load: &(impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync),
+    ) -> Result<AlignedTracks, E> {
+        let cut: Vec<Vec<(usize, Patch)>> = registered
+            .par_iter()
+            .map(|&image| Ok(self.cut(image, &*load(image)?)))
+            .collect::<Vec<Result<_, E>>>()
+            .into_iter()
+            .collect::<Result<_, E>>()?;
+        let mut patches: Vec<Option<Patch>> = vec![None; self.component.points.len()];
+        for (point, patch) in cut.into_iter().flatten() {
+            patches[point] = Some(patch);
+        }
+        let found: Vec<Vec<(usize, usize, Aligned)>> = registered
+            .par_iter()
+            .map(|&image| Ok(self.align(image, &*load(image)?, &patches)))
+            .collect::<Vec<Result<_, E>>>()
+            .into_iter()
+            .collect::<Result<_, E>>()?;
+        let mut aligned: Vec<Vec<Option<Aligned>>> =
+            self.component.points.iter().map(|point| vec![None; point.track.len()]).collect();
+        for (point, at, place) in found.into_iter().flatten() {
+            aligned[point][at] = Some(place);
+        }
+        Ok((patches, aligned))
     }
 
     /// The patches of the points whose reference this image is.
@@ -253,8 +362,57 @@ impl<'a> Tracks<'a> {
             .collect()
     }
 
+    /// Where this image shows patches of points that it does not see by a keypoint.
+    ///
+    /// The adjusted poses say where to look, to less than the noise of a keypoint. What hides the point looks different.
+    fn seek_further(
+        &self,
+        image: ImageId,
+        pyramid: &ImagePyramid,
+        patches: &[Option<Patch>],
+        middles: &[Option<Middle>],
+    ) -> Vec<Further> {
+        let Some(pose) = self.component.images[image.index()].world_from_camera else { return Vec::new() };
+        let own: BTreeSet<usize> = self.seen[image.index()].iter().map(|&(point, _)| point).collect();
+        let seek = |point: usize| {
+            let (patch, middle) = (patches[point].as_ref()?, middles[point].as_ref()?);
+            let position = self.component.points[point].position;
+            let reference = self.component.points[point].track[self.references[point]];
+            let sight = (pose.translation - position).try_normalize(0.0)?;
+            let normal = self.planes[point].column(0).cross(&self.planes[point].column(1));
+            if normal.dot(&sight).abs() < MIN_COSINE {
+                return None;
+            }
+            let camera = self.component.camera_of(image);
+            let projected = camera.project(&pose.inverse_transform_point(&position))?;
+            let pixel_from_plane = self.pixel_from_plane(point, image)?;
+            let center = projected - pixel_from_plane * middle.offset;
+            let in_reference = self.pixel_from_plane(point, reference.image)?;
+            let zoom = (pixel_from_plane.determinant() / in_reference.determinant()).abs().sqrt();
+            if !camera.contains(&center) || !(MAX_ZOOM.recip()..=MAX_ZOOM).contains(&zoom) {
+                return None;
+            }
+            let frame = self.frame_at(point, image, center, &pixel_from_plane)?;
+            let aligned = Template::new(&self.params.patch, patch)?.align(pyramid, &frame)?;
+            let limit = self.params.max_shift_sigma * f64::from(self.keypoint(reference).noise_px) * zoom;
+            let noise_px = self.noise_px(&aligned);
+            let pixel = aligned.pixel + pixel_from_plane * middle.offset;
+            ((aligned.pixel - center).norm() <= limit).then_some(Further { point, image, pixel, noise_px })
+        };
+        (0..self.component.points.len()).filter(|point| !own.contains(point)).filter_map(seek).collect()
+    }
+
+    fn noise_px(&self, aligned: &Aligned) -> f64 {
+        (self.params.noise_factor * aligned.noise_px).hypot(self.params.noise_floor_px)
+    }
+
     /// Everything free but known intrinsics and the first pose.
-    fn problem(&self, camera_fixed: &[bool], aligned: &[Vec<Option<Aligned>>]) -> BundleProblem {
+    fn problem(
+        &self,
+        camera_fixed: &[bool],
+        aligned: &[Vec<Option<Aligned>>],
+        further: &[Further],
+    ) -> BundleProblem {
         let component = self.component;
         let mut problem = BundleProblem {
             cameras: component.cameras.clone(),
@@ -276,24 +434,151 @@ impl<'a> Tracks<'a> {
                 *freedom = IntrinsicsFreedom::LENS;
             }
         }
-        let floor = self.params.noise_floor_px;
         for (index, point) in component.points.iter().enumerate() {
             problem.points.push(BundlePoint { position: point.position, fixed: false });
-            let any = aligned[index].iter().any(Option::is_some);
+            let middle = self.middle(index, &aligned[index]);
             for (at, seen) in point.track.iter().enumerate() {
                 let Some(pose) = pose_of_image[seen.image.index()] else { continue };
-                let keypoint = &self.features[seen.image.index()].keypoints[seen.feature as usize];
-                let (pixel, noise_px) = match &aligned[index][at] {
-                    Some(place) => (place.pixel, (self.params.noise_factor * place.noise_px).hypot(floor)),
-                    // The others are where this one is.
-                    None if any && at == self.references[index] => (keypoint.pixel(), floor),
-                    None => (keypoint.pixel(), f64::from(keypoint.noise_px)),
-                };
+                let (pixel, noise_px) = self.place(index, at, aligned[index][at].as_ref(), middle.as_ref());
                 problem.observations.push(BundleObservation { pose, point: index as u32, pixel, noise_px });
             }
         }
+        problem.observations.extend(further.iter().filter_map(|found| {
+            let &Further { point, image, pixel, noise_px } = found;
+            let pose = pose_of_image[image.index()]?;
+            Some(BundleObservation { pose, point: point as u32, pixel, noise_px })
+        }));
         problem
     }
+
+    fn keypoint(&self, observation: Observation) -> &Keypoint {
+        &self.features[observation.image.index()].keypoints[observation.feature as usize]
+    }
+
+    /// Pixel and standard deviation of an observation of a point.
+    fn place(
+        &self,
+        point: usize,
+        at: usize,
+        aligned: Option<&Aligned>,
+        middle: Option<&Middle>,
+    ) -> (Vector2<f64>, f64) {
+        let observation = self.component.points[point].track[at];
+        let keypoint = self.keypoint(observation);
+        let aligned = match aligned {
+            Some(place) => Some((place.pixel, self.noise_px(place))),
+            // The others are where this one is.
+            None => (at == self.references[point]).then(|| (keypoint.pixel(), self.params.noise_floor_px)),
+        };
+        let placed = middle.zip(aligned).and_then(|(middle, (pixel, noise_px))| {
+            Some((pixel + self.pixel_from_plane(point, observation.image)? * middle.offset, noise_px))
+        });
+        placed.unwrap_or_else(|| (keypoint.pixel(), f64::from(keypoint.noise_px)))
+    }
+
+    /// Where the keypoints of a point lie in the mean; `None` when none was aligned with another.
+    fn middle(&self, point: usize, aligned: &[Option<Aligned>]) -> Option<Middle> {
+        if aligned.iter().all(Option::is_none) {
+            return None;
+        }
+        let (mut information, mut sum) = (Matrix2::zeros(), Vector2::zeros());
+        for (at, &observation) in self.component.points[point].track.iter().enumerate() {
+            let keypoint = self.keypoint(observation);
+            let pixel = match &aligned[at] {
+                Some(place) => place.pixel,
+                None if at == self.references[point] => keypoint.pixel(),
+                None => continue,
+            };
+            let jacobian = self.pixel_from_plane(point, observation.image)?;
+            let weight = 1.0 / f64::from(keypoint.noise_px).powi(2);
+            information += jacobian.transpose() * jacobian * weight;
+            sum += jacobian.transpose() * (keypoint.pixel() - pixel) * weight;
+        }
+        let covariance = information.try_inverse()?;
+        Some(Middle { offset: covariance * sum, covariance })
+    }
+
+    /// Covariances of the points that were aligned, where the cameras are exact.
+    ///
+    /// What ties the views is as precise as the alignment; which spot of the surface a detector will call the keypoint
+    /// is known as the mean of its detections is.
+    fn covariances(
+        &self,
+        aligned: &[Vec<Option<Aligned>>],
+        further: &[Further],
+    ) -> Vec<Option<Matrix3<f32>>> {
+        let middles: Vec<Option<Middle>> =
+            aligned.iter().enumerate().map(|(point, aligned)| self.middle(point, aligned)).collect();
+        let mut information = vec![Matrix3::zeros(); aligned.len()];
+        let mut add = |point: usize, image: ImageId, pixel: Vector2<f64>, noise_px: f64| {
+            let bearing = self.component.images[image.index()].world_from_camera.and_then(|pose| {
+                let angle = self.component.camera_of(image).pixel_angle(&pixel)?;
+                let offset = self.component.points[point].position - pose.translation;
+                Some((offset.try_normalize(0.0)?, noise_px * angle * offset.norm()))
+            });
+            if let Some((direction, sigma)) = bearing {
+                information[point] +=
+                    (Matrix3::identity() - direction * direction.transpose()) / (sigma * sigma);
+            }
+        };
+        for (point, middle) in middles.iter().enumerate() {
+            for (at, observation) in self.component.points[point].track.iter().enumerate() {
+                let (pixel, noise_px) = self.place(point, at, aligned[point][at].as_ref(), middle.as_ref());
+                add(point, observation.image, pixel, noise_px);
+            }
+        }
+        for found in further {
+            add(found.point, found.image, found.pixel, found.noise_px);
+        }
+        let covariance = |point: usize| {
+            let (middle, plane) = (middles[point].as_ref()?, &self.planes[point]);
+            let covariance =
+                information[point].try_inverse()? + plane * middle.covariance * plane.transpose();
+            covariance.iter().all(|value| value.is_finite()).then(|| covariance.cast())
+        };
+        (0..aligned.len()).map(covariance).collect()
+    }
+}
+
+/// A view of a point's patch without a keypoint there.
+#[derive(Debug, Clone, Copy)]
+struct Further {
+    point: usize,
+    image: ImageId,
+    /// Where the mean of the point's keypoints is.
+    pixel: Vector2<f64>,
+    noise_px: f64,
+}
+
+/// Slope of the surface over the plane P: it runs through X + P·a + n·(g·a).
+///
+/// A view with the derivative J of pixels by space shows the surface as J·(P + n·gᵀ). The alignment found the map
+/// C = J·P·B·(J₀·P)⁻¹ from the reference's pixels to the view's, so (J − C·J₀)·(P + n·gᵀ) = 0: linear in g. A slope of
+/// about one is taken as likely beforehand, against [`SHAPE_SIGMA`] in the entries of B.
+fn slope(
+    plane: &Matrix3x2<f64>,
+    normal: &Vector3<f64>,
+    reference: &Matrix2x3<f64>,
+    views: impl Iterator<Item = (Matrix2x3<f64>, Matrix2<f64>)>,
+) -> Option<Vector2<f64>> {
+    let plane_from_reference = (reference * plane).try_inverse()?;
+    let (mut sum, mut weight) = (Vector2::zeros(), 0.0);
+    for (pixel_from_world, shape) in views {
+        let map = pixel_from_world * plane * shape * plane_from_reference;
+        let parallax = pixel_from_world - map * reference;
+        let lever = parallax * normal;
+        sum -= (parallax * plane).transpose() * lever;
+        weight += lever.norm_squared() + 0.5 * (SHAPE_SIGMA * pixel_from_world * plane).norm_squared();
+    }
+    let slope: Vector2<f64> = sum / weight;
+    (slope.norm() <= MAX_SLOPE).then_some(slope)
+}
+
+/// The mean of a point's keypoints on its plane.
+struct Middle {
+    /// From the keypoint of the reference.
+    offset: Vector2<f64>,
+    covariance: Matrix2<f64>,
 }
 
 /// Takes over what was adjusted.
@@ -328,5 +613,35 @@ fn store(component: &mut Reconstruction, features: &[&ImageFeatures], problem: &
         };
         let sum: f64 = point.track.iter().filter_map(squared).sum();
         point.error_sigma = (sum / point.track.len().max(1) as f64).sqrt();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_shapes_of_patches_tell_the_slope_of_the_surface() {
+        let normal = Vector3::new(0.3, -0.2, 0.9).normalize();
+        let (u, v) = tangent_basis(&normal);
+        let plane = Matrix3x2::from_columns(&[u, v]);
+        let truth = Vector2::new(0.8, -0.4);
+        let surface = plane + normal * truth.transpose();
+        // Views of a far spot from some directions: the derivative of pixels by space drops the viewing direction.
+        let view = |x: f64, y: f64| {
+            let sight = (normal + plane * Vector2::new(x, y)).normalize();
+            let (right, down) = tangent_basis(&sight);
+            Matrix2x3::from_rows(&[right.transpose(), down.transpose()]) * 400.0
+        };
+        let reference = view(0.0, 0.0);
+        let views = [view(0.4, 0.1), view(-0.3, 0.2), view(0.1, -0.5)].map(|pixel_from_world| {
+            let map = pixel_from_world * surface * (reference * surface).try_inverse().unwrap();
+            let shape = (pixel_from_world * plane).try_inverse().unwrap() * map * (reference * plane);
+            (pixel_from_world, shape)
+        });
+        let found = slope(&plane, &normal, &reference, views.into_iter()).unwrap();
+        // What is likely beforehand draws it a little towards none.
+        assert!((found - truth).norm() < 0.05 * truth.norm() && found.norm() < truth.norm(), "{found}");
+        assert_eq!(slope(&plane, &normal, &reference, [].into_iter()), None);
     }
 }

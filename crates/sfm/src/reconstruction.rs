@@ -1,4 +1,4 @@
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 use setloc_features::Camera;
 
@@ -53,6 +53,9 @@ pub struct ReconstructionPoint {
     pub color: [u8; 3],
     /// Root mean square of the angular residuals in units of their standard deviations.
     pub error_sigma: f64,
+    /// Covariance of the position where the cameras are exact, in the world's unit squared; `None` where it is what the
+    /// noise of the keypoints leaves.
+    pub covariance: Option<Matrix3<f32>>,
     /// Who sees it, sorted.
     pub track: Vec<Observation>,
 }
@@ -115,6 +118,11 @@ impl Reconstruction {
         }
         for point in &mut self.points {
             point.position = target_from_world.transform_point(&point.position);
+            point.covariance = point.covariance.map(|covariance| {
+                let turn =
+                    target_from_world.rotation.to_rotation_matrix().into_inner() * target_from_world.scale;
+                (turn * covariance.cast::<f64>() * turn.transpose()).cast()
+            });
         }
     }
 }
@@ -135,6 +143,7 @@ mod tests {
             position: Vector3::zeros(),
             color: [0; 3],
             error_sigma: 1.0,
+            covariance: None,
             track,
         };
         let model = Reconstruction {

@@ -88,7 +88,13 @@ impl Room {
             }
             if track.len() >= 2 {
                 let position = position + normal_vector(&mut rng) * 0.02;
-                points.push(ReconstructionPoint { position, color: [0; 3], error_sigma: 0.0, track });
+                points.push(ReconstructionPoint {
+                    position,
+                    color: [0; 3],
+                    error_sigma: 0.0,
+                    covariance: None,
+                    track,
+                });
             }
         }
         let images = truth
