@@ -14,7 +14,7 @@ pub struct VerdictParams {
     pub max_runner_up: f64,
     /// Largest standard deviation of the centre along its worst axis, as a share of the distance to what it sees.
     pub max_center_sigma: f64,
-    /// Largest standard deviation of the rotation about its worst axis, in radians.
+    /// Largest standard deviation of the rotation about its worst axis, in radians: 0.4°, for 1° with 95 % probability.
     pub max_rotation_sigma_rad: f64,
     /// Fewest observations on the weakest link between the scene and a photo of a set.
     pub min_link: usize,
@@ -28,7 +28,7 @@ impl Default for VerdictParams {
             max_log10_false_alarms: -6.0,
             max_runner_up: 0.5,
             max_center_sigma: 0.02,
-            max_rotation_sigma_rad: 0.009,
+            max_rotation_sigma_rad: 0.007,
             min_link: 12,
         }
     }
