@@ -1,3 +1,5 @@
+use std::collections::BTreeSet;
+
 use nalgebra::{Matrix3, Vector3};
 use setloc_features::{Camera, Rays};
 
@@ -42,6 +44,8 @@ pub(super) struct Model<'a> {
     /// Deleted points leave `None`, so that ids stay valid.
     pub points: Vec<Option<ModelPoint>>,
     point_of_feature: Vec<Vec<u32>>,
+    /// Pairs that were matched, the lower image first; `None` where nothing is said of them.
+    matched: Option<BTreeSet<(ImageId, ImageId)>>,
 }
 
 const NO_POINT: u32 = u32::MAX;
@@ -60,7 +64,16 @@ impl<'a> Model<'a> {
             poses: vec![None; input.images.len()],
             points: Vec::new(),
             point_of_feature: input.images.iter().map(|image| vec![NO_POINT; image.features.len()]).collect(),
+            matched: (!input.putative.is_empty()).then(|| {
+                let pairs = input.putative.iter();
+                pairs.map(|p| (p.first.min(p.second), p.first.max(p.second))).collect()
+            }),
         }
+    }
+
+    /// Whether two images were matched at all: of a large scene only neighbours are.
+    pub fn was_matched(&self, a: ImageId, b: ImageId) -> bool {
+        self.matched.as_ref().is_none_or(|pairs| pairs.contains(&(a.min(b), a.max(b))))
     }
 
     pub fn is_registered(&self, image: ImageId) -> bool {

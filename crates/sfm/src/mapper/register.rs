@@ -266,6 +266,9 @@ pub(super) fn hypothesize_baseline(
 const CELL_POINTS: usize = 5;
 
 /// Counts the points that a camera at this pose ought to see, and those among `inliers`.
+///
+/// Only images that were matched with this one make a point expected. Down a street of 200 panoramas those far off
+/// see the same far points alike, but nobody compared them.
 pub(super) fn visibility(
     model: &Model<'_>,
     image: ImageId,
@@ -283,7 +286,9 @@ pub(super) fn visibility(
     for (id, point) in model.live_points() {
         let familiar = point.track.iter().any(|seen| {
             model.poses[seen.image.index()].as_ref().is_some_and(|pose| {
-                seen.image != image && is_same_view(&point.position, pose.center(), &center)
+                seen.image != image
+                    && model.was_matched(seen.image, image)
+                    && is_same_view(&point.position, pose.center(), &center)
             })
         });
         if !familiar {
