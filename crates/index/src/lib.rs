@@ -23,5 +23,5 @@ pub use scene_index::{Row, SceneIndex};
 
 /// Version of the index's contents; bumped whenever equal inputs give another index.
 ///
-/// 1: exact, inverted lists, kd-tree over eight principal components.
+/// 1: exact, inverted lists, kd-tree over eight principal components. 2: covariances of aligned points.
 pub const VERSION: u32 = 2;

@@ -106,7 +106,7 @@ pub struct AlignmentReport {
 /// A component in which photos share a standpoint is left as it is: what ties their centres together is not known here.
 ///
 /// # Errors
-/// The first of `load`, in the order of images; the component is then left as it was.
+/// The first of `load`, in the order of images; the component may then be adjusted by its own views only.
 pub fn align_tracks<E: Send>(
     params: &AlignmentParams,
     component: &mut Reconstruction,
@@ -137,30 +137,36 @@ pub fn align_tracks<E: Send>(
         max_iterations: params.max_iterations,
         ..BundleParams::default()
     };
-    let mut problem = tracks.problem(camera_fixed, &aligned, &[]);
+    let mut problem = tracks.problem(camera_fixed, &aligned, &tracks.middles(&aligned), &[]);
     bundle::solve(&bundle, &mut problem);
     let (references, planes) = (tracks.references, tracks.planes);
     store(component, features, &problem);
     // Now it is known where the patches lie in views that no keypoint ties to them.
     let tracks = Tracks { planes, references, ..Tracks::new(params, component, features) };
-    let middles: Vec<Option<Middle>> =
-        aligned.iter().enumerate().map(|(point, aligned)| tracks.middle(point, aligned)).collect();
-    let further: Vec<Vec<Further>> = registered
-        .par_iter()
-        .map(|&image| Ok(tracks.seek_further(image, &*load(image)?, &patches, &middles)))
-        .collect::<Vec<Result<_, E>>>()
-        .into_iter()
-        .collect::<Result<_, E>>()?;
-    let further = further.concat();
+    let middles = tracks.middles(&aligned);
+    let further = in_each(&registered, &load, |image, pyramid| {
+        tracks.seek_further(image, pyramid, &patches, &middles)
+    })?
+    .concat();
     report.further = further.len();
-    let mut problem = tracks.problem(camera_fixed, &aligned, &further);
+    let mut problem = tracks.problem(camera_fixed, &aligned, &middles, &further);
     bundle::solve(&bundle, &mut problem);
-    let covariances = tracks.covariances(&aligned, &further);
+    let covariances = tracks.covariances(&aligned, &middles, &further);
     store(component, features, &problem);
     for (point, covariance) in component.points.iter_mut().zip(covariances) {
         point.covariance = covariance;
     }
     Ok(report)
+}
+
+/// What `work` finds in the pixels of each image; the first error of `load` in the order of images.
+fn in_each<T: Send, E: Send>(
+    images: &[ImageId],
+    load: &(impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync),
+    work: impl Fn(ImageId, &ImagePyramid) -> T + Sync,
+) -> Result<Vec<T>, E> {
+    let found: Vec<Result<T, E>> = images.par_iter().map(|&image| Ok(work(image, &*load(image)?))).collect();
+    found.into_iter().collect()
 }
 
 /// Whether two images have one centre, as photos turned on the spot do.
@@ -231,15 +237,14 @@ impl<'a> Tracks<'a> {
     fn spacing(&self, point: usize) -> Option<f64> {
         let reference = self.component.points[point].track.get(self.references[point])?;
         let area = self.pixel_from_plane(point, reference.image)?.determinant().abs();
-        let size = self.features[reference.image.index()].keypoints[reference.feature as usize].size;
+        let size = self.keypoint(*reference).size;
         let spacing = (self.params.spacing * f64::from(size)).max(1.0) / area.sqrt();
         (spacing.is_finite() && spacing > 0.0).then_some(spacing)
     }
 
     fn frame(&self, point: usize, observation: Observation) -> Option<PatchFrame> {
         let pixel_from_plane = self.pixel_from_plane(point, observation.image)?;
-        let keypoint = &self.features[observation.image.index()].keypoints[observation.feature as usize];
-        self.frame_at(point, observation.image, keypoint.pixel(), &pixel_from_plane)
+        self.frame_at(point, observation.image, self.keypoint(observation).pixel(), &pixel_from_plane)
     }
 
     /// The patch of a point in a view, with the curvature that its plane has there.
@@ -307,22 +312,12 @@ impl<'a> Tracks<'a> {
         registered: &[ImageId],
         load: &(impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync),
     ) -> Result<AlignedTracks, E> {
-        let cut: Vec<Vec<(usize, Patch)>> = registered
-            .par_iter()
-            .map(|&image| Ok(self.cut(image, &*load(image)?)))
-            .collect::<Vec<Result<_, E>>>()
-            .into_iter()
-            .collect::<Result<_, E>>()?;
+        let cut = in_each(registered, load, |image, pyramid| self.cut(image, pyramid))?;
         let mut patches: Vec<Option<Patch>> = vec![None; self.component.points.len()];
         for (point, patch) in cut.into_iter().flatten() {
             patches[point] = Some(patch);
         }
-        let found: Vec<Vec<(usize, usize, Aligned)>> = registered
-            .par_iter()
-            .map(|&image| Ok(self.align(image, &*load(image)?, &patches)))
-            .collect::<Vec<Result<_, E>>>()
-            .into_iter()
-            .collect::<Result<_, E>>()?;
+        let found = in_each(registered, load, |image, pyramid| self.align(image, pyramid, &patches))?;
         let mut aligned: Vec<Vec<Option<Aligned>>> =
             self.component.points.iter().map(|point| vec![None; point.track.len()]).collect();
         for (point, at, place) in found.into_iter().flatten() {
@@ -355,8 +350,7 @@ impl<'a> Tracks<'a> {
                 let frame = self.frame(point, observation)?;
                 let aligned =
                     Template::new(&self.params.patch, patches[point].as_ref()?)?.align(pyramid, &frame)?;
-                let keypoint = &self.features[image.index()].keypoints[observation.feature as usize];
-                let limit = self.params.max_shift_sigma * f64::from(keypoint.noise_px);
+                let limit = self.params.max_shift_sigma * f64::from(self.keypoint(observation).noise_px);
                 ((aligned.pixel - frame.center).norm() <= limit).then_some((point, at, aligned))
             })
             .collect()
@@ -411,6 +405,7 @@ impl<'a> Tracks<'a> {
         &self,
         camera_fixed: &[bool],
         aligned: &[Vec<Option<Aligned>>],
+        middles: &[Option<Middle>],
         further: &[Further],
     ) -> BundleProblem {
         let component = self.component;
@@ -436,10 +431,10 @@ impl<'a> Tracks<'a> {
         }
         for (index, point) in component.points.iter().enumerate() {
             problem.points.push(BundlePoint { position: point.position, fixed: false });
-            let middle = self.middle(index, &aligned[index]);
             for (at, seen) in point.track.iter().enumerate() {
                 let Some(pose) = pose_of_image[seen.image.index()] else { continue };
-                let (pixel, noise_px) = self.place(index, at, aligned[index][at].as_ref(), middle.as_ref());
+                let (pixel, noise_px) =
+                    self.place(index, at, aligned[index][at].as_ref(), middles[index].as_ref());
                 problem.observations.push(BundleObservation { pose, point: index as u32, pixel, noise_px });
             }
         }
@@ -476,6 +471,10 @@ impl<'a> Tracks<'a> {
         placed.unwrap_or_else(|| (keypoint.pixel(), f64::from(keypoint.noise_px)))
     }
 
+    fn middles(&self, aligned: &[Vec<Option<Aligned>>]) -> Vec<Option<Middle>> {
+        aligned.iter().enumerate().map(|(point, aligned)| self.middle(point, aligned)).collect()
+    }
+
     /// Where the keypoints of a point lie in the mean; `None` when none was aligned with another.
     fn middle(&self, point: usize, aligned: &[Option<Aligned>]) -> Option<Middle> {
         if aligned.iter().all(Option::is_none) {
@@ -505,10 +504,9 @@ impl<'a> Tracks<'a> {
     fn covariances(
         &self,
         aligned: &[Vec<Option<Aligned>>],
+        middles: &[Option<Middle>],
         further: &[Further],
     ) -> Vec<Option<Matrix3<f32>>> {
-        let middles: Vec<Option<Middle>> =
-            aligned.iter().enumerate().map(|(point, aligned)| self.middle(point, aligned)).collect();
         let mut information = vec![Matrix3::zeros(); aligned.len()];
         let mut add = |point: usize, image: ImageId, pixel: Vector2<f64>, noise_px: f64| {
             let bearing = self.component.images[image.index()].world_from_camera.and_then(|pose| {
