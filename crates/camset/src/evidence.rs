@@ -3,7 +3,9 @@
 use nalgebra::{Matrix2, Matrix2x3, Unit, Vector2, Vector3};
 use setloc_features::{Camera, ImageFeatures, Rays};
 use setloc_index::SceneIndex;
-use setloc_sfm::{PointId, Rigid};
+use setloc_sfm::{Place, PointId, Rigid};
+
+use crate::refine::Sighting;
 
 /// Feature `feature` of a photo shows scene point `point`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -43,19 +45,26 @@ impl<'a> PhotoRays<'a> {
         ray_error_sigmas(&bearing_in_world, sigma, &offset, &index.position_covariance(found.point))
     }
 
-    /// Error of a feature that sees a point whose own uncertainty does not count, in standard deviations of the ray.
-    pub(crate) fn point_error_sigmas(
+    /// Where a keypoint is, with its noise.
+    pub(crate) fn place_of(&self, feature: u32) -> Place {
+        let keypoint = &self.features.keypoints[feature as usize];
+        Place { pixel: keypoint.pixel(), noise_px: f64::from(keypoint.noise_px) }
+    }
+
+    /// Error of a place that shows a point, in standard deviations of a keypoint and of the point together.
+    pub(crate) fn sighting_error_sigmas(
         &self,
         world_from_camera: &Rigid,
-        feature: u32,
+        seen: &Sighting,
         point: &Vector3<f64>,
+        point_covariance: &nalgebra::Matrix3<f64>,
     ) -> f64 {
-        let (bearing, sigma) = (self.rays.bearings[feature as usize], self.rays.sigmas[feature as usize]);
-        if !sigma.is_finite() {
-            return f64::INFINITY;
-        }
+        let pixel = &seen.place.pixel;
+        let ray = self.camera.unproject(pixel).zip(self.camera.pixel_angle(pixel));
+        let Some((bearing, angle)) = ray else { return f64::INFINITY };
         let offset = point - world_from_camera.translation;
-        ray_error_sigmas(&(world_from_camera.rotation * bearing), sigma, &offset, &nalgebra::Matrix3::zeros())
+        let bearing = world_from_camera.rotation * bearing;
+        ray_error_sigmas(&bearing, seen.keypoint_noise_px * angle, &offset, point_covariance)
     }
 
     /// Standard deviation of a match in pixels: of the keypoint and of the scene point together.

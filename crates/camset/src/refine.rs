@@ -1,6 +1,6 @@
 //! Bundle problems over photos in a scene whose cameras stay fixed.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector2, Vector3};
 use setloc_features::Camera;
@@ -9,7 +9,7 @@ use setloc_sfm::bundle::{
     self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
     RobustLoss,
 };
-use setloc_sfm::{PointId, Rigid};
+use setloc_sfm::{Place, PointId, Rigid};
 
 use crate::evidence::{PhotoRays, SceneMatch};
 
@@ -41,54 +41,66 @@ pub(crate) struct JointPhoto {
     pub standpoint: usize,
 }
 
-/// Slot `photo` of a joint model sees local point `point` with one of its features.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct TrackObservation {
+/// A place in a photo where it shows a local point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Sighting {
+    /// Slot of the photo.
     pub photo: usize,
-    pub feature: u32,
-    pub point: usize,
+    /// The keypoint, where one belongs to the point.
+    pub feature: Option<u32>,
+    /// The place, in pixels, with its standard deviation against the other places of the point.
+    pub place: Place,
+    /// Standard deviation of a keypoint of the point in this photo, in pixels.
+    pub keypoint_noise_px: f64,
+}
+
+/// What photos see.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct JointObservations {
+    /// Scene points that each photo sees by a keypoint.
+    pub direct: Vec<Vec<SceneMatch>>,
+    /// Aligned local points that are scene points. Keypoints that they hold do not count in `direct` again.
+    pub tied: Vec<TiedPoint>,
+    /// Free local points, by their index, and where they are seen.
+    pub tracks: Vec<(usize, Sighting)>,
+}
+
+/// A local point that is a scene point.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct TiedPoint {
+    pub scene: PointId,
+    /// Where the photos show it.
+    pub seen: Vec<Sighting>,
+    /// Covariance of the spot that they show about the scene's, in the scene's frame.
+    pub spot: Matrix3<f64>,
 }
 
 /// Moves photos and local points (the paper's T_OPT), scene points within what the scene knows of them; returns
 /// covariances of the poses if asked.
 ///
-/// `direct[i]` are the scene points that photo `i` sees. A camera is estimated only when it is not known and enough
-/// observations support it. Poses without any observation stay where they are.
+/// A camera is estimated only when it is not known and enough observations support it. Poses without any observation
+/// stay where they are.
 pub(crate) fn refine_jointly(
     model: &mut JointModel,
     index: &SceneIndex,
     rays: &[PhotoRays<'_>],
-    direct: &[Vec<SceneMatch>],
-    tracks: &[TrackObservation],
+    observed: &JointObservations,
     with_covariance: bool,
 ) -> Vec<Option<Matrix6<f64>>> {
-    let mut points: Vec<BundlePoint> =
-        model.points.iter().map(|&position| BundlePoint { position, fixed: false }).collect();
-    let mut scene_points: BTreeMap<PointId, u32> = BTreeMap::new();
-    let mut observations = Vec::with_capacity(tracks.len() + direct.iter().map(Vec::len).sum::<usize>());
-    let mut support = vec![0_usize; model.cameras.len()];
-    let mut observed = vec![0_usize; model.photos.len()];
     let standpoints = Standpoints::new(&model.photos);
-    for (slot, matches) in direct.iter().enumerate() {
-        let photo = &model.photos[slot];
-        for &found in matches {
-            let point = *scene_points.entry(found.point).or_insert_with(|| {
-                // An exact point has no bearings that hold it.
-                let fixed = index.position_covariance(found.point) == Matrix3::zeros();
-                points.push(BundlePoint { position: index.position(found.point), fixed });
-                points.len() as u32 - 1
-            });
-            observations.extend(standpoints.observation(rays, slot, found.feature, point));
-        }
-        support[photo.camera] += matches.len();
-        observed[photo.standpoint] += matches.len();
-    }
-    for track in tracks {
-        let photo = &model.photos[track.photo];
-        observations.extend(standpoints.observation(rays, track.photo, track.feature, track.point as u32));
-        support[photo.camera] += 1;
-        observed[photo.standpoint] += 1;
-    }
+    let mut builder = Builder {
+        points: model.points.iter().map(|&position| BundlePoint { position, fixed: false }).collect(),
+        observations: Vec::new(),
+        origins: Vec::new(),
+        support: vec![0; model.cameras.len()],
+        seen: vec![0; model.photos.len()],
+        priors: Vec::new(),
+        photos: &model.photos,
+        standpoints: &standpoints,
+        rays,
+    };
+    builder.add_all(index, observed);
+    let Builder { points, mut observations, mut origins, support, seen, priors, .. } = builder;
     let camera_freedom = support
         .iter()
         .zip(&model.camera_fixed)
@@ -103,28 +115,24 @@ pub(crate) fn refine_jointly(
     let mut poses: Vec<BundlePose> = model
         .photos
         .iter()
-        .zip(&observed)
+        .zip(&seen)
         .enumerate()
-        .map(|(slot, (photo, &observed))| BundlePose {
+        .map(|(slot, (photo, &seen))| BundlePose {
             camera: if standpoints.shared[slot] { model.cameras.len() } else { photo.camera } as u32,
             world_from_camera: photo.world_from_camera,
-            fixed: observed < 3,
+            fixed: seen < 3,
         })
         .collect();
     let mut cameras = model.cameras.clone();
     cameras.push(sphere());
-    for (&scene_point, &point) in &scene_points {
-        let covariance = index.position_covariance(scene_point);
-        for prior in prior_bearings(&index.position(scene_point), &covariance) {
+    for &(point, ref covariance) in &priors {
+        for prior in prior_bearings(&points[point as usize].position, covariance) {
             let pose = poses.len() as u32;
             let camera = model.cameras.len() as u32;
             poses.push(BundlePose { camera, world_from_camera: prior.world_from_camera, fixed: true });
-            observations.push(BundleObservation {
-                pose,
-                point,
-                pixel: prior.pixel,
-                noise_px: prior.noise_px,
-            });
+            let PriorBearing { pixel, noise_px, .. } = prior;
+            observations.push(BundleObservation { pose, point, pixel, noise_px });
+            origins.push(Origin::Far);
         }
     }
     let mut problem =
@@ -132,8 +140,7 @@ pub(crate) fn refine_jointly(
     let params = BundleParams { loss: RobustLoss::Cauchy(LOSS_SCALE), ..BundleParams::default() };
     bundle::solve(&params, &mut problem);
     if with_covariance {
-        let seen = direct.iter().map(Vec::len).sum::<usize>();
-        state_real_noise(&mut problem, seen, tracks.len(), scene_points.len());
+        state_real_noise(&mut problem, &origins, priors.len());
         bundle::solve(&params, &mut problem);
     }
     for (camera, refined) in model.cameras.iter_mut().zip(&problem.cameras) {
@@ -156,44 +163,132 @@ pub(crate) fn refine_jointly(
         .collect()
 }
 
+/// What an observation ties a photo to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Origin {
+    /// A scene point, by a keypoint.
+    Scene,
+    /// Other photos of the set.
+    Local,
+    /// What the scene knows of a point.
+    Far,
+}
+
+/// Collects the points and observations of a bundle problem.
+struct Builder<'a> {
+    points: Vec<BundlePoint>,
+    observations: Vec<BundleObservation>,
+    origins: Vec<Origin>,
+    /// Observations of each camera.
+    support: Vec<usize>,
+    /// Observations of each photo's standpoint.
+    seen: Vec<usize>,
+    /// Scene points, and what is known of them.
+    priors: Vec<(u32, Matrix3<f64>)>,
+    photos: &'a [JointPhoto],
+    standpoints: &'a Standpoints,
+    rays: &'a [PhotoRays<'a>],
+}
+
+impl Builder<'_> {
+    fn add_all(&mut self, index: &SceneIndex, observed: &JointObservations) {
+        let mut held = BTreeSet::new();
+        for tied in &observed.tied {
+            let covariance = index.position_covariance(tied.scene) + tied.spot;
+            let point = self.add_scene_point(index.position(tied.scene), covariance);
+            for seen in &tied.seen {
+                self.observe(seen.photo, &seen.place, point, Origin::Local);
+                held.extend(seen.feature.map(|feature| (seen.photo, feature)));
+            }
+        }
+        let mut scene_points: BTreeMap<PointId, u32> = BTreeMap::new();
+        for (slot, matches) in observed.direct.iter().enumerate() {
+            for found in matches.iter().filter(|found| !held.contains(&(slot, found.feature))) {
+                let point = *scene_points.entry(found.point).or_insert_with(|| {
+                    self.add_scene_point(index.position(found.point), index.position_covariance(found.point))
+                });
+                self.observe(slot, &self.rays[slot].place_of(found.feature), point, Origin::Scene);
+            }
+        }
+        for (point, seen) in &observed.tracks {
+            self.observe(seen.photo, &seen.place, *point as u32, Origin::Local);
+        }
+    }
+
+    fn add_scene_point(&mut self, position: Vector3<f64>, covariance: Matrix3<f64>) -> u32 {
+        let point = self.points.len() as u32;
+        // An exact point has no bearings that hold it.
+        let fixed = covariance == Matrix3::zeros();
+        self.points.push(BundlePoint { position, fixed });
+        if !fixed {
+            self.priors.push((point, covariance));
+        }
+        point
+    }
+
+    fn observe(&mut self, slot: usize, place: &Place, point: u32, origin: Origin) {
+        let photo = &self.photos[slot];
+        self.support[photo.camera] += 1;
+        self.seen[photo.standpoint] += 1;
+        if let Some(observation) = self.standpoints.observation(self.rays, slot, place, point) {
+            self.observations.push(observation);
+            self.origins.push(origin);
+        }
+    }
+}
+
 /// Degrees of freedom that stand behind the keypoints' stated noise before any residual is seen.
 const STATED_FREEDOM: f64 = 20.0;
 /// Least variance, relative to what keypoints state.
 const LEAST_VARIANCE: f64 = 0.25;
 
-/// Scales the noise of the scene's matches and of the local tracks by what their residuals show, each by itself.
+/// Scales the noise of what ties the set to the scene and of what ties its photos by what their residuals show, each by
+/// itself.
 ///
 /// Keypoints state the noise between photos of one light. A photo of another light, of other optics or far nearer to a
 /// surface than the panoramas agrees less with the scene, and its set agrees better with itself: on rendered sets under
 /// another light residuals had 1.5–2.9 and 0.5–1.1 times the stated variance. Estimated as variance components
 /// (F. R. Helmert; K.-R. Koch, "Parameter estimation and hypothesis testing in linear models", 1999, § 3.6), shrunk
-/// towards what was stated. Observations come as `seen` scene matches, then `tracks`, then far bearings.
-fn state_real_noise(problem: &mut BundleProblem, seen: usize, tracks: usize, scene_points: usize) {
+/// towards what was stated. `origins` are those of the observations, `scene_points` the number of points with far
+/// bearings.
+fn state_real_noise(problem: &mut BundleProblem, origins: &[Origin], scene_points: usize) {
     let nothing = BundleParams { max_iterations: 0, ..BundleParams::default() };
-    let squared = |kept: &dyn Fn(usize) -> bool| {
-        let observations = problem.observations.iter().enumerate();
+    let squared = |kept: &dyn Fn(Origin) -> bool| {
+        let observations = problem.observations.iter().zip(origins);
         let mut part = BundleProblem {
-            observations: observations.filter(|(at, _)| kept(*at)).map(|(_, o)| *o).collect(),
+            observations: observations.filter(|(_, origin)| kept(**origin)).map(|(o, _)| *o).collect(),
             ..problem.clone()
         };
         let report = bundle::solve(&nothing, &mut part);
         (2.0 * report.initial_cost, report.degrees_of_freedom as f64)
     };
-    let far = problem.observations.len() - seen - tracks;
+    let count = |wanted: Origin| origins.iter().filter(|origin| **origin == wanted).count() as f64;
     let (of_all, freedom) = squared(&|_| true);
-    let (of_scene, _) = squared(&|at| at < seen || at >= seen + tracks);
+    let (of_local, _) = squared(&|origin| origin == Origin::Local);
     // Three far bearings say as much as three coordinates.
-    let freedom = freedom - 2.0 * far as f64 + 3.0 * scene_points as f64;
+    let coordinates = 3.0 * scene_points as f64;
+    let freedom = freedom - 2.0 * count(Origin::Far) + coordinates;
+    // The coordinates of scene points that only keypoints see are unknowns too; those of the others are known from the
+    // set itself.
+    let of_points = |wanted: Origin| {
+        let observations = problem.observations.iter().zip(origins);
+        observations
+            .filter(|(_, origin)| **origin == wanted)
+            .map(|(observation, _)| observation.point)
+            .collect::<BTreeSet<u32>>()
+    };
+    let by_keypoints = of_points(Origin::Far).difference(&of_points(Origin::Local)).count() as f64;
     // The scene places the photos as a whole: six parameters, and the scale.
-    let scene_freedom = (2.0 * seen as f64 - 7.0).clamp(0.0, freedom.max(0.0));
+    let scene_freedom = 2.0 * count(Origin::Scene) + coordinates - 3.0 * by_keypoints - 7.0;
+    let scene_freedom = scene_freedom.clamp(0.0, freedom.max(0.0));
     let component = |squared: f64, freedom: f64| {
         let variance = (squared + STATED_FREEDOM) / (freedom.max(0.0) + STATED_FREEDOM);
         if variance.is_finite() { variance.max(LEAST_VARIANCE).sqrt() } else { 1.0 }
     };
-    let scene = component(of_scene, scene_freedom);
-    let local = component(of_all - of_scene, freedom - scene_freedom);
-    for (at, observation) in problem.observations.iter_mut().take(seen + tracks).enumerate() {
-        observation.noise_px *= if at < seen { scene } else { local };
+    let scene = component(of_all - of_local, scene_freedom);
+    let local = component(of_local, freedom - scene_freedom);
+    for (observation, origin) in problem.observations.iter_mut().zip(origins) {
+        observation.noise_px *= if *origin == Origin::Local { local } else { scene };
     }
 }
 
@@ -234,20 +329,20 @@ impl Standpoints {
         Self { lead, turn, shared, sphere: sphere() }
     }
 
-    /// The observation of a bundle point by a photo's feature, of the standpoint's pose where the centre is shared.
+    /// The observation of a bundle point at a place in a photo, of the standpoint's pose where the centre is shared.
     fn observation(
         &self,
         rays: &[PhotoRays<'_>],
         slot: usize,
-        feature: u32,
+        place: &Place,
         point: u32,
     ) -> Option<BundleObservation> {
-        let keypoint = &rays[slot].features.keypoints[feature as usize];
-        let (mut pixel, mut noise_px) = (keypoint.pixel(), f64::from(keypoint.noise_px));
+        let Place { mut pixel, mut noise_px } = *place;
         if self.shared[slot] {
-            let seen = &rays[slot].rays;
-            pixel = self.sphere.project(&(self.turn[slot] * seen.bearings[feature as usize]))?;
-            noise_px = seen.sigmas[feature as usize] / self.sphere.pixel_angle(&pixel)?;
+            let camera = rays[slot].camera;
+            let sigma = noise_px * camera.pixel_angle(&pixel)?;
+            pixel = self.sphere.project(&(self.turn[slot] * camera.unproject(&pixel)?))?;
+            noise_px = sigma / self.sphere.pixel_angle(&pixel)?;
         }
         Some(BundleObservation { pose: self.lead[slot] as u32, point, pixel, noise_px })
     }
@@ -353,7 +448,8 @@ mod tests {
             points: Vec::new(),
         };
         let rays = [PhotoRays::new(&view.features, &world.camera)];
-        let covariances = refine_jointly(&mut model, &world.index, &rays, &[matches], &[], true);
+        let seen = JointObservations { direct: vec![matches], ..JointObservations::default() };
+        let covariances = refine_jointly(&mut model, &world.index, &rays, &seen, true);
         let (center, rotation) = world.errors(0, &model.photos[0].world_from_camera);
         assert!(center < 0.03 && rotation < 0.1, "{center} {rotation}");
         let covariance = covariances[0].expect("fixed points leave nothing undetermined");

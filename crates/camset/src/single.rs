@@ -10,7 +10,7 @@ use crate::evidence::{
     PhotoRays, SceneMatch, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose,
 };
 use crate::guided::guided_matches;
-use crate::refine::{JointModel, JointPhoto, refine_jointly};
+use crate::refine::{JointModel, JointObservations, JointPhoto, refine_jointly};
 use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
 use crate::{PhotoLocalization, QueryPhoto, Scene, SingleParams, Verdict};
 
@@ -171,7 +171,8 @@ fn refine(
         if agreeing.len() <= SAMPLE {
             return None;
         }
-        let covariances = refine_jointly(model, index, &[rays], &[agreeing], &[], last && with_covariance);
+        let seen = JointObservations { direct: vec![agreeing], ..JointObservations::default() };
+        let covariances = refine_jointly(model, index, &[rays], &seen, last && with_covariance);
         covariance = covariances.into_iter().next().flatten();
     }
     covariance

@@ -119,6 +119,7 @@ fn model_of(place: &Place, views: &[View], camera: &Camera) -> (Reconstruction, 
         color: [128; 3],
         error_sigma: 1.0,
         covariance: None,
+        aligned: None,
         track,
     };
     let shown: Vec<usize> = (0..tracks.len()).filter(|&i| tracks[i].len() >= 2).collect();

@@ -215,6 +215,7 @@ mod tests {
                 color: [0; 3],
                 error_sigma: 1.0,
                 covariance: None,
+                aligned: None,
                 track,
             });
             truth.push(center);

@@ -30,7 +30,7 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 3);
+serde_artifact!(SceneFile, "scene", 4);
 
 impl SceneFile {
     /// Reads a scene file.

@@ -25,7 +25,7 @@ use setloc_features::{
 };
 
 use crate::{
-    ImageId, Observation, Reconstruction, Rigid,
+    AlignedTrack, ImageId, Observation, Place, Reconstruction, Rigid,
     bundle::{
         self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
         RobustLoss,
@@ -35,7 +35,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 3;
+pub const ALIGNMENT_VERSION: u32 = 4;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;
@@ -151,10 +151,10 @@ pub fn align_tracks<E: Send>(
     report.further = further.len();
     let mut problem = tracks.problem(camera_fixed, &aligned, &middles, &further);
     bundle::solve(&bundle, &mut problem);
-    let covariances = tracks.covariances(&aligned, &middles, &further);
+    let placed = tracks.placed(&aligned, &middles, &further);
     store(component, features, &problem);
-    for (point, covariance) in component.points.iter_mut().zip(covariances) {
-        point.covariance = covariance;
+    for (point, placed) in component.points.iter_mut().zip(placed) {
+        (point.aligned, point.covariance) = placed.unzip();
     }
     Ok(report)
 }
@@ -391,7 +391,11 @@ impl<'a> Tracks<'a> {
             let limit = self.params.max_shift_sigma * f64::from(self.keypoint(reference).noise_px) * zoom;
             let noise_px = self.noise_px(&aligned);
             let pixel = aligned.pixel + pixel_from_plane * middle.offset;
-            ((aligned.pixel - center).norm() <= limit).then_some(Further { point, image, pixel, noise_px })
+            ((aligned.pixel - center).norm() <= limit).then_some(Further {
+                point,
+                image,
+                place: Place { pixel, noise_px },
+            })
         };
         (0..self.component.points.len()).filter(|point| !own.contains(point)).filter_map(seek).collect()
     }
@@ -433,13 +437,13 @@ impl<'a> Tracks<'a> {
             problem.points.push(BundlePoint { position: point.position, fixed: false });
             for (at, seen) in point.track.iter().enumerate() {
                 let Some(pose) = pose_of_image[seen.image.index()] else { continue };
-                let (pixel, noise_px) =
+                let Place { pixel, noise_px } =
                     self.place(index, at, aligned[index][at].as_ref(), middles[index].as_ref());
                 problem.observations.push(BundleObservation { pose, point: index as u32, pixel, noise_px });
             }
         }
         problem.observations.extend(further.iter().filter_map(|found| {
-            let &Further { point, image, pixel, noise_px } = found;
+            let &Further { point, image, place: Place { pixel, noise_px } } = found;
             let pose = pose_of_image[image.index()]?;
             Some(BundleObservation { pose, point: point as u32, pixel, noise_px })
         }));
@@ -450,14 +454,8 @@ impl<'a> Tracks<'a> {
         &self.features[observation.image.index()].keypoints[observation.feature as usize]
     }
 
-    /// Pixel and standard deviation of an observation of a point.
-    fn place(
-        &self,
-        point: usize,
-        at: usize,
-        aligned: Option<&Aligned>,
-        middle: Option<&Middle>,
-    ) -> (Vector2<f64>, f64) {
+    /// Where a view of the track shows a point.
+    fn place(&self, point: usize, at: usize, aligned: Option<&Aligned>, middle: Option<&Middle>) -> Place {
         let observation = self.component.points[point].track[at];
         let keypoint = self.keypoint(observation);
         let aligned = match aligned {
@@ -466,9 +464,10 @@ impl<'a> Tracks<'a> {
             None => (at == self.references[point]).then(|| (keypoint.pixel(), self.params.noise_floor_px)),
         };
         let placed = middle.zip(aligned).and_then(|(middle, (pixel, noise_px))| {
-            Some((pixel + self.pixel_from_plane(point, observation.image)? * middle.offset, noise_px))
+            let pixel = pixel + self.pixel_from_plane(point, observation.image)? * middle.offset;
+            Some(Place { pixel, noise_px })
         });
-        placed.unwrap_or_else(|| (keypoint.pixel(), f64::from(keypoint.noise_px)))
+        placed.unwrap_or_else(|| Place { pixel: keypoint.pixel(), noise_px: f64::from(keypoint.noise_px) })
     }
 
     fn middles(&self, aligned: &[Vec<Option<Aligned>>]) -> Vec<Option<Middle>> {
@@ -497,44 +496,45 @@ impl<'a> Tracks<'a> {
         Some(Middle { offset: covariance * sum, covariance })
     }
 
-    /// Covariances of the points that were aligned, where the cameras are exact.
+    /// The points that were aligned: where their views show them, and their covariance where the cameras are exact.
     ///
     /// What ties the views is as precise as the alignment; which spot of the surface a detector will call the keypoint
     /// is known as the mean of its detections is.
-    fn covariances(
+    fn placed(
         &self,
         aligned: &[Vec<Option<Aligned>>],
         middles: &[Option<Middle>],
         further: &[Further],
-    ) -> Vec<Option<Matrix3<f32>>> {
-        let mut information = vec![Matrix3::zeros(); aligned.len()];
-        let mut add = |point: usize, image: ImageId, pixel: Vector2<f64>, noise_px: f64| {
-            let bearing = self.component.images[image.index()].world_from_camera.and_then(|pose| {
-                let angle = self.component.camera_of(image).pixel_angle(&pixel)?;
-                let offset = self.component.points[point].position - pose.translation;
-                Some((offset.try_normalize(0.0)?, noise_px * angle * offset.norm()))
-            });
-            if let Some((direction, sigma)) = bearing {
-                information[point] +=
-                    (Matrix3::identity() - direction * direction.transpose()) / (sigma * sigma);
-            }
-        };
-        for (point, middle) in middles.iter().enumerate() {
-            for (at, observation) in self.component.points[point].track.iter().enumerate() {
-                let (pixel, noise_px) = self.place(point, at, aligned[point][at].as_ref(), middle.as_ref());
-                add(point, observation.image, pixel, noise_px);
-            }
-        }
+    ) -> Vec<Option<(AlignedTrack, Matrix3<f32>)>> {
+        let mut further_of = vec![Vec::new(); aligned.len()];
         for found in further {
-            add(found.point, found.image, found.pixel, found.noise_px);
+            further_of[found.point].push((found.image, found.place));
         }
-        let covariance = |point: usize| {
+        let placed = |(point, further): (usize, Vec<(ImageId, Place)>)| {
             let (middle, plane) = (middles[point].as_ref()?, &self.planes[point]);
-            let covariance =
-                information[point].try_inverse()? + plane * middle.covariance * plane.transpose();
-            covariance.iter().all(|value| value.is_finite()).then(|| covariance.cast())
+            let track = &self.component.points[point].track;
+            let places: Vec<Place> = (0..track.len())
+                .map(|at| self.place(point, at, aligned[point][at].as_ref(), Some(middle)))
+                .collect();
+            let seen = track.iter().map(|seen| seen.image).zip(&places);
+            let views = seen.chain(further.iter().map(|(image, place)| (*image, place)));
+            let information: Matrix3<f64> = views.filter_map(|view| self.information(point, view)).sum();
+            let spot = plane * middle.covariance * plane.transpose();
+            let covariance = information.try_inverse()? + spot;
+            let aligned = AlignedTrack { places, further, spot: spot.cast() };
+            covariance.iter().all(|value| value.is_finite()).then(|| (aligned, covariance.cast()))
         };
-        (0..aligned.len()).map(covariance).collect()
+        further_of.into_iter().enumerate().map(placed).collect()
+    }
+
+    /// What a view says of the place of a point.
+    fn information(&self, point: usize, (image, place): (ImageId, &Place)) -> Option<Matrix3<f64>> {
+        let pose = self.component.images[image.index()].world_from_camera?;
+        let angle = self.component.camera_of(image).pixel_angle(&place.pixel)?;
+        let offset = self.component.points[point].position - pose.translation;
+        let sigma = place.noise_px * angle * offset.norm();
+        let direction = offset.try_normalize(0.0)?;
+        Some((Matrix3::identity() - direction * direction.transpose()) / (sigma * sigma))
     }
 }
 
@@ -544,8 +544,7 @@ struct Further {
     point: usize,
     image: ImageId,
     /// Where the mean of the point's keypoints is.
-    pixel: Vector2<f64>,
-    noise_px: f64,
+    place: Place,
 }
 
 /// Slope of the surface over the plane P: it runs through X + P·a + n·(g·a).

@@ -1,4 +1,4 @@
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 use setloc_features::Camera;
 
@@ -58,6 +58,29 @@ pub struct ReconstructionPoint {
     pub covariance: Option<Matrix3<f32>>,
     /// Who sees it, sorted.
     pub track: Vec<Observation>,
+    /// Where the pixels of the views place it; `None` where only keypoints do.
+    pub aligned: Option<AlignedTrack>,
+}
+
+/// The views of a point, placed by their pixels so that all show one spot; see [`crate::align_tracks`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct AlignedTrack {
+    /// Places in the views of the track, in its order.
+    pub places: Vec<Place>,
+    /// Places in views without a keypoint of the point.
+    pub further: Vec<(ImageId, Place)>,
+    /// Covariance of what the views have in common: how far a detector's next keypoint will be from that spot, in the
+    /// world's unit squared.
+    pub spot: Matrix3<f32>,
+}
+
+/// A place in an image.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Place {
+    /// In pixels.
+    pub pixel: Vector2<f64>,
+    /// Standard deviation of each coordinate, against the other views of the point.
+    pub noise_px: f64,
 }
 
 /// One connected component of a scene or of a local model.
@@ -94,6 +117,15 @@ impl Reconstruction {
             for observation in &mut point.track {
                 observation.image = id_of[observation.image.index()];
             }
+            if let Some(aligned) = &mut point.aligned {
+                let mut order: Vec<usize> = (0..aligned.places.len()).collect();
+                order.sort_by_key(|&at| point.track.get(at));
+                aligned.places = order.iter().map(|&at| aligned.places[at]).collect();
+                for (image, _) in &mut aligned.further {
+                    *image = id_of[image.index()];
+                }
+                aligned.further.sort_by_key(|(image, _)| *image);
+            }
             point.track.sort_unstable();
         }
         let images = order.iter().map(|&at| self.images[at].clone()).collect();
@@ -118,11 +150,13 @@ impl Reconstruction {
         }
         for point in &mut self.points {
             point.position = target_from_world.transform_point(&point.position);
-            point.covariance = point.covariance.map(|covariance| {
-                let turn =
-                    target_from_world.rotation.to_rotation_matrix().into_inner() * target_from_world.scale;
-                (turn * covariance.cast::<f64>() * turn.transpose()).cast()
-            });
+            let turned = |covariance: &Matrix3<f32>| {
+                target_from_world.transform_covariance(&covariance.cast()).cast::<f32>()
+            };
+            point.covariance = point.covariance.as_ref().map(turned);
+            if let Some(aligned) = &mut point.aligned {
+                aligned.spot = turned(&aligned.spot);
+            }
         }
     }
 }
@@ -145,6 +179,7 @@ mod tests {
             error_sigma: 1.0,
             covariance: None,
             track,
+            aligned: None,
         };
         let model = Reconstruction {
             cameras: Vec::new(),

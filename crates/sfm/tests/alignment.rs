@@ -93,6 +93,7 @@ impl Room {
                     color: [0; 3],
                     error_sigma: 0.0,
                     covariance: None,
+                    aligned: None,
                     track,
                 });
             }

@@ -2,10 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::Matrix6;
+use nalgebra::{Matrix3, Matrix6};
 use rayon::prelude::*;
 use setloc_features::Camera;
-use setloc_sfm::{PointId, Reconstruction, Rigid, Similarity};
+use setloc_sfm::{ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
 
 use super::PhotoEvidence;
 use super::correspondences::{SetCorrespondence, correspondences, set_rays};
@@ -14,7 +14,7 @@ use crate::evidence::{
     PhotoRays, SceneMatch, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose,
 };
 use crate::guided::guided_matches;
-use crate::refine::{JointModel, JointPhoto, TrackObservation, refine_jointly};
+use crate::refine::{JointModel, JointObservations, JointPhoto, Sighting, TiedPoint, refine_jointly};
 use crate::single::{inliers, union};
 use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
 use crate::{CamsetParams, GuidedParams, PhotoLocalization, QueryPhoto, Scene, Verdict};
@@ -96,12 +96,6 @@ fn refuse_without_scale(photo: &mut PhotoLocalization) {
     photo.covariance = None;
     photo.verdict = Verdict::NotLocalized;
     photo.reasons.push("how far it is from the photo that sees the scene is not known".to_owned());
-}
-
-/// Observations of one round of the joint refinement.
-struct Observations {
-    direct: Vec<Vec<SceneMatch>>,
-    tracks: Vec<TrackObservation>,
 }
 
 /// Observations that a photo's six degrees of freedom can fit whatever they are.
@@ -285,17 +279,17 @@ impl Component<'_> {
             let cameras = model.cameras.clone();
             let rays = self.rays(&cameras);
             let observations = if round == 0 {
-                self.rigid_observations(candidates, &rigid.agreeing)
+                self.rigid_observations(candidates, rigid)
             } else {
                 let steps = (self.params.rounds - round).min(WIDENING.len() - 1);
-                self.observations(&model, &rays, candidates, WIDENING[WIDENING.len() - 1 - steps])
+                let widening = WIDENING[WIDENING.len() - 1 - steps];
+                self.observations(&model, &rays, candidates, world_from_set, widening)
             };
-            let Observations { direct, tracks } = observations;
             let last = round == self.params.rounds;
-            covariances = refine_jointly(&mut model, self.scene.index, &rays, &direct, &tracks, last);
+            covariances = refine_jointly(&mut model, self.scene.index, &rays, &observations, last);
         }
         let rays = self.rays(&model.cameras);
-        let direct = self.observations(&model, &rays, candidates, 1.0).direct;
+        let direct = self.observations(&model, &rays, candidates, world_from_set, 1.0).direct;
         Joint { model, direct, covariances }
     }
 
@@ -309,17 +303,27 @@ impl Component<'_> {
     }
 
     /// Correspondences that agree with the rigid pose, as they are.
-    fn rigid_observations(&self, candidates: &[SetCorrespondence], agreeing: &[usize]) -> Observations {
+    fn rigid_observations(&self, candidates: &[SetCorrespondence], rigid: &RigidPose) -> JointObservations {
         let mut direct = vec![Vec::new(); self.members.len()];
-        let mut tied = BTreeSet::new();
-        for &number in agreeing {
+        let (mut locals, mut tied) = (BTreeSet::new(), Vec::new());
+        for &number in &rigid.agreeing {
             let candidate = &candidates[number];
-            tied.extend(candidate.local);
             for &(slot, feature) in &candidate.seen_by {
                 direct[slot].push(SceneMatch { feature, point: candidate.scene });
             }
+            if let Some(local) = candidate.local.filter(|local| locals.insert(*local)) {
+                tied.extend(self.tied(local, candidate.scene, &rigid.world_from_set));
+            }
         }
-        Observations { direct: direct.into_iter().map(unique).collect(), tracks: self.free_tracks(&tied) }
+        let direct = direct.into_iter().map(unique).collect();
+        JointObservations { direct, tied, tracks: self.free_tracks(&locals) }
+    }
+
+    /// A local point as a scene point with all its sightings, where it is aligned.
+    fn tied(&self, local: usize, scene: PointId, world_from_set: &Similarity) -> Option<TiedPoint> {
+        let aligned = self.model.points[local].aligned.as_ref()?;
+        let spot = world_from_set.transform_covariance(&aligned.spot.cast());
+        Some(TiedPoint { scene, seen: self.sightings(local), spot })
     }
 
     /// Correspondences and guided matches that agree with the present poses.
@@ -330,8 +334,9 @@ impl Component<'_> {
         model: &JointModel,
         rays: &[PhotoRays<'_>],
         candidates: &[SetCorrespondence],
+        world_from_set: &Similarity,
         widening: f64,
-    ) -> Observations {
+    ) -> JointObservations {
         let index = self.scene.index;
         let bound = self.params.max_error_sigmas * widening;
         let guided_params =
@@ -372,7 +377,7 @@ impl Component<'_> {
             );
         }
         let mut direct: Vec<Vec<SceneMatch>> = vec![Vec::new(); self.members.len()];
-        let mut tied = BTreeSet::new();
+        let (mut locals, mut tied) = (BTreeSet::new(), Vec::new());
         for (local, votes) in votes {
             let track = self.track(local);
             let best = votes
@@ -387,19 +392,28 @@ impl Component<'_> {
             if agreeing == 0 || 2 * agreeing < track.len() {
                 continue;
             }
-            tied.insert(local);
+            locals.insert(local);
             for (slot, feature) in track {
                 if agrees(slot, feature, point) {
                     direct[slot].push(SceneMatch { feature, point });
                 }
+            }
+            if let Some(mut point_seen) = self.tied(local, point, world_from_set) {
+                let position = index.position(point);
+                let noise = index.position_covariance(point);
+                point_seen.seen.retain(|seen| {
+                    let pose = &model.photos[seen.photo].world_from_camera;
+                    rays[seen.photo].sighting_error_sigmas(pose, seen, &position, &noise) < bound
+                });
+                tied.push(point_seen);
             }
         }
         for (slot, lone) in lone.iter().enumerate() {
             let agreeing = inliers(&rays[slot], index, &model.photos[slot].world_from_camera, lone, bound);
             direct[slot] = unique(union(&direct[slot], &agreeing));
         }
-        let tracks = agreeing_tracks(model, rays, self.free_tracks(&tied), bound);
-        Observations { direct, tracks }
+        let tracks = agreeing_tracks(model, rays, self.free_tracks(&locals), bound);
+        JointObservations { direct, tied, tracks }
     }
 
     /// Slots and features that see a local point.
@@ -412,6 +426,33 @@ impl Component<'_> {
             .collect()
     }
 
+    /// Where the photos show a local point: by their pixels where it is aligned, else by their keypoints.
+    fn sightings(&self, local: usize) -> Vec<Sighting> {
+        let point = &self.model.points[local];
+        let features = |slot: usize| self.photos[self.members[slot]].features;
+        let slot_of = |image: ImageId| self.members.binary_search(&image.index()).ok();
+        let by_keypoint = point.track.iter().enumerate().filter_map(|(at, seen)| {
+            let photo = slot_of(seen.image)?;
+            let keypoint = features(photo).keypoints.get(seen.feature as usize)?;
+            let keypoint_noise_px = f64::from(keypoint.noise_px);
+            let place = match &point.aligned {
+                Some(aligned) => *aligned.places.get(at)?,
+                None => Place { pixel: keypoint.pixel(), noise_px: keypoint_noise_px },
+            };
+            Some(Sighting { photo, feature: Some(seen.feature), place, keypoint_noise_px })
+        });
+        let mut sightings: Vec<Sighting> = by_keypoint.collect();
+        if let Some(aligned) = &point.aligned {
+            let noise = sightings.iter().map(|seen| seen.keypoint_noise_px).collect();
+            let keypoint_noise_px = median(noise).unwrap_or(0.0);
+            let further = aligned.further.iter().filter_map(|&(image, place)| {
+                Some(Sighting { photo: slot_of(image)?, feature: None, place, keypoint_noise_px })
+            });
+            sightings.extend(further);
+        }
+        sightings
+    }
+
     fn local_points_of_features(&self) -> Vec<BTreeMap<u32, usize>> {
         let mut local_of = vec![BTreeMap::new(); self.members.len()];
         for local in 0..self.model.points.len() {
@@ -422,18 +463,14 @@ impl Component<'_> {
         local_of
     }
 
-    /// Observations of all local points that are not scene points.
-    fn free_tracks(&self, tied: &BTreeSet<usize>) -> Vec<TrackObservation> {
+    /// Sightings of all local points that are not scene points.
+    fn free_tracks(&self, tied: &BTreeSet<usize>) -> Vec<(usize, Sighting)> {
         (0..self.model.points.len())
             .filter(|local| !tied.contains(local))
-            .flat_map(|point| {
-                let track = self.track(point);
-                let seen_twice = track.len() >= 2;
-                track.into_iter().filter(move |_| seen_twice).map(move |(photo, feature)| TrackObservation {
-                    photo,
-                    feature,
-                    point,
-                })
+            .flat_map(|local| {
+                let seen = self.sightings(local);
+                let seen_twice = seen.len() >= 2;
+                seen.into_iter().filter(move |_| seen_twice).map(move |seen| (local, seen))
             })
             .collect()
     }
@@ -560,19 +597,19 @@ impl Component<'_> {
 fn agreeing_tracks(
     model: &JointModel,
     rays: &[PhotoRays<'_>],
-    tracks: Vec<TrackObservation>,
+    tracks: Vec<(usize, Sighting)>,
     bound: f64,
-) -> Vec<TrackObservation> {
-    let mut seen = vec![0_usize; model.points.len()];
+) -> Vec<(usize, Sighting)> {
+    let mut views = vec![0_usize; model.points.len()];
     let mut agreeing = tracks;
-    agreeing.retain(|track| {
-        let pose = &model.photos[track.photo].world_from_camera;
-        let agrees =
-            rays[track.photo].point_error_sigmas(pose, track.feature, &model.points[track.point]) < bound;
-        seen[track.point] += usize::from(agrees);
-        agrees
+    agreeing.retain(|(point, seen)| {
+        let pose = &model.photos[seen.photo].world_from_camera;
+        let error =
+            rays[seen.photo].sighting_error_sigmas(pose, seen, &model.points[*point], &Matrix3::zeros());
+        views[*point] += usize::from(error < bound);
+        error < bound
     });
-    agreeing.retain(|track| seen[track.point] >= 2);
+    agreeing.retain(|(point, _)| views[*point] >= 2);
     agreeing
 }
 

@@ -110,11 +110,10 @@ pub fn add_model(
         graph.accept(model, pair_role(a, b), used.verified);
         graph.accept(model, matches_role(a, b), used.matches);
     }
-    let model = match kind {
-        ModelKind::Scene if config.alignment.enabled => {
-            add_alignment(graph, images, &features, model, fixed, &config.alignment)
-        }
-        _ => model,
+    let model = if config.alignment.enabled {
+        add_alignment(graph, images, &features, model, fixed, &config.alignment)
+    } else {
+        model
     };
     Ok(ModelJobs { features, model })
 }

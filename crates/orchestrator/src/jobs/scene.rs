@@ -125,6 +125,10 @@ fn named(model: &Reconstruction, names: &[String]) -> Reconstruction {
     for image in &mut model.images {
         image.name = with_names(&image.name, names);
     }
+    // Where pixels show the points has done its part: it placed the points.
+    for point in &mut model.points {
+        point.aligned = None;
+    }
     model
 }
 

@@ -44,6 +44,12 @@ impl Similarity {
         self.rotation * point_in_source * self.scale + self.translation
     }
 
+    /// Maps the covariance of a point from the source to the target frame.
+    pub fn transform_covariance(&self, in_source: &Matrix3<f64>) -> Matrix3<f64> {
+        let turn = self.rotation.to_rotation_matrix().into_inner() * self.scale;
+        turn * in_source * turn.transpose()
+    }
+
     /// Maps a pose given in the source frame: `target_from_camera` of a `source_from_camera`.
     ///
     /// The camera frame keeps its own unit of length, so the result is rigid.

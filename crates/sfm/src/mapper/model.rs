@@ -280,6 +280,7 @@ impl<'a> Model<'a> {
                 color: color_sum.map(|sum| (sum / n as u32) as u8),
                 error_sigma: (squared_error / n as f64).sqrt(),
                 covariance: None,
+                aligned: None,
                 track,
             });
         }
