@@ -12,6 +12,7 @@ use setloc_sfm::bundle::{
 use setloc_sfm::{Place, PointId, Rigid};
 
 use crate::evidence::{PhotoRays, SceneMatch};
+use crate::jackknife::honest_covariances;
 
 /// Scale of the robust loss in standard deviations: at one deviation an observation has half its weight, at four (an
 /// inlier still) a seventeenth, so leftovers among the matches hardly pull.
@@ -139,9 +140,14 @@ pub(crate) fn refine_jointly(
         BundleProblem { cameras, camera_freedom, poses, points, observations, position_priors: Vec::new() };
     let params = BundleParams { loss: RobustLoss::Cauchy(LOSS_SCALE), ..BundleParams::default() };
     bundle::solve(&params, &mut problem);
+    let mut of_leads = vec![None; model.photos.len()];
     if with_covariance {
         state_real_noise(&mut problem, &origins, priors.len());
         bundle::solve(&params, &mut problem);
+        let photos = model.photos.len();
+        of_leads = honest_covariances(&params, &mut problem, photos, |problem, loss| {
+            covariances(problem, photos, loss)
+        });
     }
     for (camera, refined) in model.cameras.iter_mut().zip(&problem.cameras) {
         camera.clone_from(refined);
@@ -153,14 +159,10 @@ pub(crate) fn refine_jointly(
     for (point, refined) in model.points.iter_mut().zip(&problem.points) {
         *point = refined.position;
     }
-    if !with_covariance {
-        return vec![None; model.photos.len()];
-    }
-    // What is left are inliers: each counts in full.
-    let of_leads = covariances(&problem, model.photos.len(), RobustLoss::Trivial);
-    (0..model.photos.len())
-        .map(|slot| Some(turned(of_leads[model.photos[slot].standpoint].as_ref()?, &standpoints.turn[slot])))
-        .collect()
+    let of_photo = |(slot, photo): (usize, &JointPhoto)| {
+        Some(turned(of_leads[photo.standpoint].as_ref()?, &standpoints.turn[slot]))
+    };
+    model.photos.iter().enumerate().map(of_photo).collect()
 }
 
 /// What an observation ties a photo to.

@@ -231,6 +231,18 @@ mod tests {
     }
 
     #[test]
+    fn aligned_places_outdo_keypoints_that_err_alike() {
+        let mut world = World::chain(9, 0.2, 3);
+        world.stretch_keypoints(0.001);
+        let by_keypoints = worst_errors(&world, &locate(&world, &CamsetParams::default()).refined);
+        world.align(0.05, 1);
+        let found = locate(&world, &CamsetParams::default());
+        let aligned = worst_errors(&world, &found.refined);
+        assert!(aligned.0 < 0.5 * by_keypoints.0 && aligned.0 < 0.1, "{by_keypoints:?} {aligned:?}");
+        assert!(found.refined.iter().all(|photo| photo.verdict == Verdict::Localized));
+    }
+
+    #[test]
     fn a_set_from_one_centre_has_no_scale() {
         let place = Place::street(3500, 4);
         let center = Vector3::new(0.0, -1.5, 22.0);

@@ -147,6 +147,13 @@ fn solve(
     }
     let guided = guided_matches(&params.guided, scene.index, &rays, nearest, &pose);
     let candidates = union(&agreeing, &guided);
+    // Where nearly all matches lie on one plane, the few that were found beyond it may tell another pose nearby.
+    if let Some(other) = estimate(params, scene.index, &rays, &candidates, seed ^ 0x9a1d)
+        && score(params, scene.index, &rays, &other, &candidates)
+            > score(params, scene.index, &rays, &pose, &candidates)
+    {
+        model.photos[0].world_from_camera = other;
+    }
     let covariance = refine(&mut model, scene.index, photo, &candidates, params.max_error_sigmas, true);
     let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);

@@ -1,14 +1,14 @@
 //! A street with truth: panoramas at its beginning, a chain of photos that leads away from them.
 
-use nalgebra::{UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Matrix3, UnitQuaternion, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
 use setloc_index::{IndexParams, SceneIndex};
 use setloc_sfm::synthetic::normal;
 use setloc_sfm::{
-    CameraId, ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint, Rigid,
-    Similarity,
+    AlignedTrack, CameraId, ImageId, Observation, PointId, Reconstruction, ReconstructionImage,
+    ReconstructionPoint, Rigid, Similarity,
 };
 
 use crate::evidence::SceneMatch;
@@ -225,6 +225,34 @@ impl World {
         }
         for point in &mut self.local.points {
             point.position = drift[point.track[0].image.index()].transform_point(&point.position);
+        }
+    }
+
+    /// Aligns the local points: each view shows them to `noise_px`.
+    pub(crate) fn align(&mut self, noise_px: f64, seed: u64) {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        for point in &mut self.local.points {
+            let place = |seen: &Observation| {
+                let pose = self.local.images[seen.image.index()].world_from_camera.unwrap();
+                let pixel = self.camera.project(&pose.inverse_transform_point(&point.position)).unwrap();
+                setloc_sfm::Place {
+                    pixel: pixel + noise_px * Vector2::from_fn(|_, _| normal(&mut rng)),
+                    noise_px,
+                }
+            };
+            let places = point.track.iter().map(place).collect();
+            let spot = Matrix3::identity() * 1e-6;
+            point.aligned = Some(AlignedTrack { places, further: Vec::new(), spot });
+        }
+    }
+
+    /// Lets the keypoints of photo `i` err alike: away from the middle by the share `i · share`.
+    pub(crate) fn stretch_keypoints(&mut self, share: f64) {
+        let middle = self.camera.width as f32 / 2.0;
+        for (i, view) in self.photos.iter_mut().enumerate() {
+            for keypoint in &mut view.features.keypoints {
+                keypoint.x += (keypoint.x - middle) * (share * i as f64) as f32;
+            }
         }
     }
 

@@ -162,6 +162,10 @@ impl Component<'_> {
         let remarks = vec![format!("the local model of {}: {}", names.join(", "), reasons.join("; "))];
         let mut rigid_answers =
             self.rigid_answers(&set_from_camera, &candidates, &rigid, rigid_support, &reasons);
+        // A photo that its own points do not hold in the refinement is held by nothing else before it.
+        for (rigid, refined) in rigid_answers.iter_mut().zip(&refined) {
+            rigid.verdict = weaker(rigid.verdict, refined.verdict);
+        }
         for slot in without_scale {
             refuse_without_scale(&mut rigid_answers[slot]);
         }
