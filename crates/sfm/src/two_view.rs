@@ -10,7 +10,6 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another geometry.
-pub const TWO_VIEW_VERSION: u32 = 2;
 
 /// How to verify a pair.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -140,7 +140,9 @@ fn invert_radius(distorted: f64, k1: f64, k2: f64) -> Option<f64> {
             high *= 2.0;
         }
     }
-    let mut r = distorted.min(high);
+    // Far out the highest power is all there is; Newton from the distorted radius would need a step for each fifth.
+    let far = if k2 > 0.0 { (distorted / k2).powf(0.2) } else { (distorted / k1.max(0.0)).cbrt() };
+    let mut r = distorted.min(high).min(far);
     for _ in 0..MAX_ITERATIONS {
         let residual = radius_of(r) - distorted;
         if residual > 0.0 {
@@ -149,7 +151,7 @@ fn invert_radius(distorted: f64, k1: f64, k2: f64) -> Option<f64> {
             low = r;
         }
         let newton = r - residual / radial_slope(r * r, k1, k2);
-        let next = if newton > low && newton < high { newton } else { f64::midpoint(low, high) };
+        let next = if (low..=high).contains(&newton) { newton } else { f64::midpoint(low, high) };
         if (next - r).abs() <= 2.0 * f64::EPSILON * r {
             return Some(next);
         }

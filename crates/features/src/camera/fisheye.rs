@@ -150,7 +150,7 @@ fn invert(radius: f64, terms: &[f64; 4]) -> Option<f64> {
             low = theta;
         }
         let newton = theta - residual / slope(theta, terms);
-        let next = if newton > low && newton < high { newton } else { f64::midpoint(low, high) };
+        let next = if (low..=high).contains(&newton) { newton } else { f64::midpoint(low, high) };
         if (next - theta).abs() <= 2.0 * f64::EPSILON * theta {
             return Some(next);
         }

@@ -247,6 +247,19 @@ fn one_pixel_spans_the_expected_angle() {
     assert_eq!(photo.focal_length(), 900.0);
 }
 
+#[test]
+fn directions_far_off_the_axis_survive_a_round_trip() {
+    for camera in cameras() {
+        for z in [1e-1, 1e-2, 1e-3, 4e-4, 1e-4] {
+            let direction = Vector3::new(0.0, 0.9386, z);
+            if let Some(pixel) = camera.project(&direction) {
+                let back = camera.unproject(&pixel).unwrap();
+                assert!(angle(&direction, &back) < 1e-9, "{camera:?} {z}: {}", angle(&direction, &back));
+            }
+        }
+    }
+}
+
 proptest! {
     #[test]
     fn any_direction_survives_a_round_trip(
