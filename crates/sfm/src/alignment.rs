@@ -14,7 +14,6 @@
 //! Tracks, features and points stay what they are; poses, points and free intrinsics move.
 
 use std::cmp::Ordering;
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, Vector2, Vector3};
@@ -41,6 +40,12 @@ pub const ALIGNMENT_VERSION: u32 = 3;
 const MIN_COSINE: f64 = 0.5;
 /// Largest factor between the resolutions of a patch in its reference and where it is sought without a keypoint.
 const MAX_ZOOM: f64 = 2.0;
+
+/// Points that an image must share with the reference of a patch to be searched for it: far away in a large scene nothing
+/// is found.
+const MIN_SHARED_POINTS: usize = 12;
+/// Correlation where a patch is expected without a keypoint below which something else is there.
+const MIN_CORRELATION_AT_FIRST: f64 = -1.0;
 
 /// Standard deviation of the entries of the linear map between two patches, which noise and relief leave.
 const SHAPE_SIGMA: f64 = 0.05;
@@ -122,14 +127,14 @@ pub fn align_tracks<E: Send>(
     // The first alignment tells the slant of the surfaces, the second goes by it.
     let (_, facing) = tracks.align_all(&registered, &load)?;
     tracks.planes = tracks.tilted_planes(&facing);
-    let (patches, aligned) = tracks.align_all(&registered, &load)?;
+    let (templates, aligned) = tracks.align_all(&registered, &load)?;
     let mut report =
         AlignmentReport { aligned: aligned.iter().flatten().flatten().count(), ..AlignmentReport::default() };
     report.points = aligned.iter().filter(|track| track.iter().any(Option::is_some)).count();
-    report.sought = patches
+    report.sought = templates
         .iter()
         .zip(&component.points)
-        .filter(|(patch, _)| patch.is_some())
+        .filter(|(template, _)| template.is_some())
         .map(|(_, point)| point.track.len() - 1)
         .sum();
     let bundle = BundleParams {
@@ -145,7 +150,7 @@ pub fn align_tracks<E: Send>(
     let tracks = Tracks { planes, references, ..Tracks::new(params, component, features) };
     let middles = tracks.middles(&aligned);
     let further = in_each(&registered, &load, |image, pyramid| {
-        tracks.seek_further(image, pyramid, &patches, &middles)
+        tracks.seek_further(image, pyramid, &templates, &middles)
     })?
     .concat();
     report.further = further.len();
@@ -181,8 +186,8 @@ fn shares_standpoints(component: &Reconstruction, registered: &[ImageId]) -> boo
     centers.windows(2).any(|pair| pair[0] == pair[1])
 }
 
-/// Patches by point, and where the views show them by point and place in the track.
-type AlignedTracks = (Vec<Option<Patch>>, Vec<Vec<Option<Aligned>>>);
+/// Templates by point, and where the views show them by point and place in the track.
+type AlignedTracks = (Vec<Option<Template>>, Vec<Vec<Option<Aligned>>>);
 
 /// A component with what is asked of its tracks.
 struct Tracks<'a> {
@@ -313,25 +318,26 @@ impl<'a> Tracks<'a> {
         load: &(impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync),
     ) -> Result<AlignedTracks, E> {
         let cut = in_each(registered, load, |image, pyramid| self.cut(image, pyramid))?;
-        let mut patches: Vec<Option<Patch>> = vec![None; self.component.points.len()];
-        for (point, patch) in cut.into_iter().flatten() {
-            patches[point] = Some(patch);
+        let mut templates: Vec<Option<Template>> = vec![None; self.component.points.len()];
+        for (point, template) in cut.into_iter().flatten() {
+            templates[point] = Some(template);
         }
-        let found = in_each(registered, load, |image, pyramid| self.align(image, pyramid, &patches))?;
+        let found = in_each(registered, load, |image, pyramid| self.align(image, pyramid, &templates))?;
         let mut aligned: Vec<Vec<Option<Aligned>>> =
             self.component.points.iter().map(|point| vec![None; point.track.len()]).collect();
         for (point, at, place) in found.into_iter().flatten() {
             aligned[point][at] = Some(place);
         }
-        Ok((patches, aligned))
+        Ok((templates, aligned))
     }
 
-    /// The patches of the points whose reference this image is.
-    fn cut(&self, image: ImageId, pyramid: &ImagePyramid) -> Vec<(usize, Patch)> {
+    /// The patches of the points whose reference this image is, where they have texture.
+    fn cut(&self, image: ImageId, pyramid: &ImagePyramid) -> Vec<(usize, Template)> {
         let own = self.seen[image.index()].iter().filter(|(point, at)| self.references[*point] == *at);
         own.filter_map(|&(point, at)| {
             let frame = self.frame(point, self.component.points[point].track[at])?;
-            Some((point, Patch::cut(&self.params.patch, pyramid, &frame)?))
+            let patch = Patch::cut(&self.params.patch, pyramid, &frame)?;
+            Some((point, Template::new(&self.params.patch, patch)?))
         })
         .collect()
     }
@@ -341,15 +347,15 @@ impl<'a> Tracks<'a> {
         &self,
         image: ImageId,
         pyramid: &ImagePyramid,
-        patches: &[Option<Patch>],
+        templates: &[Option<Template>],
     ) -> Vec<(usize, usize, Aligned)> {
         let others = self.seen[image.index()].iter().filter(|(point, at)| self.references[*point] != *at);
         others
             .filter_map(|&(point, at)| {
                 let observation = self.component.points[point].track[at];
+                let template = templates[point].as_ref()?;
                 let frame = self.frame(point, observation)?;
-                let aligned =
-                    Template::new(&self.params.patch, patches[point].as_ref()?)?.align(pyramid, &frame)?;
+                let aligned = template.align(pyramid, &frame, -1.0)?;
                 let limit = self.params.max_shift_sigma * f64::from(self.keypoint(observation).noise_px);
                 ((aligned.pixel - frame.center).norm() <= limit).then_some((point, at, aligned))
             })
@@ -363,13 +369,12 @@ impl<'a> Tracks<'a> {
         &self,
         image: ImageId,
         pyramid: &ImagePyramid,
-        patches: &[Option<Patch>],
+        templates: &[Option<Template>],
         middles: &[Option<Middle>],
     ) -> Vec<Further> {
         let Some(pose) = self.component.images[image.index()].world_from_camera else { return Vec::new() };
-        let own: BTreeSet<usize> = self.seen[image.index()].iter().map(|&(point, _)| point).collect();
         let seek = |point: usize| {
-            let (patch, middle) = (patches[point].as_ref()?, middles[point].as_ref()?);
+            let (template, middle) = (templates[point].as_ref()?, middles[point].as_ref()?);
             let position = self.component.points[point].position;
             let reference = self.component.points[point].track[self.references[point]];
             let sight = (pose.translation - position).try_normalize(0.0)?;
@@ -387,13 +392,33 @@ impl<'a> Tracks<'a> {
                 return None;
             }
             let frame = self.frame_at(point, image, center, &pixel_from_plane)?;
-            let aligned = Template::new(&self.params.patch, patch)?.align(pyramid, &frame)?;
+            let aligned = template.align(pyramid, &frame, MIN_CORRELATION_AT_FIRST)?;
             let limit = self.params.max_shift_sigma * f64::from(self.keypoint(reference).noise_px) * zoom;
             let noise_px = self.noise_px(&aligned);
             let pixel = aligned.pixel + pixel_from_plane * middle.offset;
             ((aligned.pixel - center).norm() <= limit).then_some(Further { point, image, pixel, noise_px })
         };
-        (0..self.component.points.len()).filter(|point| !own.contains(point)).filter_map(seek).collect()
+        self.others_in_reach(image).into_iter().filter_map(seek).collect()
+    }
+
+    /// The points that an image does not see by a keypoint, of references that share points with it; ascending.
+    fn others_in_reach(&self, image: ImageId) -> Vec<usize> {
+        let mut shared = vec![0_usize; self.seen.len()];
+        let mut is_own = vec![false; self.component.points.len()];
+        for &(point, _) in &self.seen[image.index()] {
+            is_own[point] = true;
+            for seen in &self.component.points[point].track {
+                shared[seen.image.index()] += 1;
+            }
+        }
+        let neighbours = self.seen.iter().zip(shared).filter(|(_, shared)| *shared >= MIN_SHARED_POINTS);
+        let mut points: Vec<usize> = neighbours
+            .flat_map(|(seen, _)| seen)
+            .filter(|&&(point, at)| self.references[point] == at && !is_own[point])
+            .map(|&(point, _)| point)
+            .collect();
+        points.sort_unstable();
+        points
     }
 
     fn noise_px(&self, aligned: &Aligned) -> f64 {
