@@ -30,14 +30,16 @@ impl Scope {
     pub fn local(model: &Model<'_>, image: ImageId, neighbours: usize) -> Self {
         let mut shared = vec![0_usize; model.poses.len()];
         let mut points = Vec::new();
-        for (id, point) in model.live_points() {
-            if point.track.iter().any(|seen| seen.image == image) {
+        for (_, id) in model.observations_of(image) {
+            if let Some(point) = model.point(id) {
                 points.push(id);
                 for seen in &point.track {
                     shared[seen.image.index()] += 1;
                 }
             }
         }
+        points.sort_unstable();
+        points.dedup();
         let mut others: Vec<ImageId> =
             model.registered().filter(|&other| other != image && shared[other.index()] > 0).collect();
         others.sort_by_key(|other| (std::cmp::Reverse(shared[other.index()]), *other));

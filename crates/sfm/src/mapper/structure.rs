@@ -1,3 +1,5 @@
+use rayon::prelude::*;
+
 use super::{correspondence::CorrespondenceGraph, model::Model};
 use crate::{ImageId, Observation, PointId};
 
@@ -7,6 +9,9 @@ pub(super) struct PointLimits {
     pub max_error_sigma: f64,
     pub min_angle_rad: f64,
 }
+
+/// Points that are worth handing to another thread.
+const POINTS_PER_TASK: usize = 256;
 
 /// Continues existing points into `image` and creates new ones from its unexplained matches.
 pub(super) fn triangulate_image(
@@ -161,26 +166,28 @@ fn merge(model: &mut Model<'_>, limits: PointLimits, id: PointId, other: PointId
     }
 }
 
-/// Drops observations and points that violate the limits. Returns the observations dropped.
-pub(super) fn filter(model: &mut Model<'_>, limits: PointLimits) -> usize {
+/// Drops what violates the limits among these points and their observations. Returns the observations dropped.
+pub(super) fn filter(model: &mut Model<'_>, limits: PointLimits, points: &[PointId]) -> usize {
+    let judge = |&id: &PointId| {
+        let point = model.point(id)?;
+        let agrees = |seen: &Observation| {
+            model.error_sigma(*seen, &point.position).is_some_and(|error| error <= limits.max_error_sigma)
+        };
+        let (kept, bad): (Vec<Observation>, Vec<Observation>) =
+            point.track.iter().partition(|seen| agrees(seen));
+        let stays = kept.len() >= 2 && model.max_angle(&point.position, &kept) >= limits.min_angle_rad;
+        (!stays || !bad.is_empty()).then_some((id, stays, bad))
+    };
+    let judged: Vec<_> = points.par_iter().with_min_len(POINTS_PER_TASK).filter_map(judge).collect();
     let mut dropped = 0;
-    for id in model.live_ids() {
+    for (id, stays, bad) in judged {
         let Some(point) = model.point(id) else { continue };
-        let bad: Vec<Observation> = point
-            .track
-            .iter()
-            .copied()
-            .filter(|&seen| {
-                !model.error_sigma(seen, &point.position).is_some_and(|error| error <= limits.max_error_sigma)
-            })
-            .collect();
-        dropped += bad.len();
-        for observation in bad {
-            model.remove_observation(id, observation);
-        }
-        let Some(point) = model.point(id) else { continue };
-        if point.track.len() < 2 || !(model.max_angle(&point.position, &point.track) >= limits.min_angle_rad)
-        {
+        if stays {
+            dropped += bad.len();
+            for observation in bad {
+                model.remove_observation(id, observation);
+            }
+        } else {
             dropped += point.track.len();
             model.remove_point(id);
         }
