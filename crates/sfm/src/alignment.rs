@@ -308,7 +308,8 @@ impl<'a> Tracks<'a> {
             let (u, v) = tangent_basis(&(normal - plane * slope).try_normalize(0.0)?);
             Some(Matrix3x2::from_columns(&[u, v]))
         };
-        aligned.iter().enumerate().map(|entry| tilted(entry).unwrap_or(self.planes[entry.0])).collect()
+        let points = aligned.par_iter().enumerate();
+        points.map(|entry| tilted(entry).unwrap_or(self.planes[entry.0])).collect()
     }
 
     /// Pixels that a step of a point spans in a view.
@@ -462,15 +463,19 @@ impl<'a> Tracks<'a> {
                 *freedom = IntrinsicsFreedom::LENS;
             }
         }
-        for (index, point) in component.points.iter().enumerate() {
-            problem.points.push(BundlePoint { position: point.position, fixed: false });
-            for (at, seen) in point.track.iter().enumerate() {
-                let Some(pose) = pose_of_image[seen.image.index()] else { continue };
-                let (pixel, noise_px) =
-                    self.place(index, at, aligned[index][at].as_ref(), middles[index].as_ref());
-                problem.observations.push(BundleObservation { pose, point: index as u32, pixel, noise_px });
-            }
-        }
+        let points = component.points.iter();
+        problem.points = points.map(|point| BundlePoint { position: point.position, fixed: false }).collect();
+        let observation = |point: usize, at: usize| {
+            let seen = component.points[point].track[at];
+            let pose = pose_of_image[seen.image.index()]?;
+            let (pixel, noise_px) =
+                self.place(point, at, aligned[point][at].as_ref(), middles[point].as_ref());
+            Some(BundleObservation { pose, point: point as u32, pixel, noise_px })
+        };
+        let points = component.points.par_iter().enumerate();
+        problem.observations = points
+            .flat_map_iter(|(point, seen)| (0..seen.track.len()).filter_map(move |at| observation(point, at)))
+            .collect();
         problem.observations.extend(further.iter().filter_map(|found| {
             let &Further { point, image, pixel, noise_px } = found;
             let pose = pose_of_image[image.index()]?;
@@ -505,7 +510,7 @@ impl<'a> Tracks<'a> {
     }
 
     fn middles(&self, aligned: &[Vec<Option<Aligned>>]) -> Vec<Option<Middle>> {
-        aligned.iter().enumerate().map(|(point, aligned)| self.middle(point, aligned)).collect()
+        aligned.par_iter().enumerate().map(|(point, aligned)| self.middle(point, aligned)).collect()
     }
 
     /// Where the keypoints of a point lie in the mean; `None` when none was aligned with another.
@@ -540,34 +545,34 @@ impl<'a> Tracks<'a> {
         middles: &[Option<Middle>],
         further: &[Further],
     ) -> Vec<Option<Matrix3<f32>>> {
-        let mut information = vec![Matrix3::zeros(); aligned.len()];
-        let mut add = |point: usize, image: ImageId, pixel: Vector2<f64>, noise_px: f64| {
-            let bearing = self.component.images[image.index()].world_from_camera.and_then(|pose| {
-                let angle = self.component.camera_of(image).pixel_angle(&pixel)?;
-                let offset = self.component.points[point].position - pose.translation;
-                Some((offset.try_normalize(0.0)?, noise_px * angle * offset.norm()))
-            });
-            if let Some((direction, sigma)) = bearing {
-                information[point] +=
-                    (Matrix3::identity() - direction * direction.transpose()) / (sigma * sigma);
-            }
-        };
-        for (point, middle) in middles.iter().enumerate() {
-            for (at, observation) in self.component.points[point].track.iter().enumerate() {
-                let (pixel, noise_px) = self.place(point, at, aligned[point][at].as_ref(), middle.as_ref());
-                add(point, observation.image, pixel, noise_px);
-            }
-        }
-        for found in further {
-            add(found.point, found.image, found.pixel, found.noise_px);
-        }
+        let mut further: Vec<&Further> = further.iter().collect();
+        further.sort_by_key(|found| found.point);
         let covariance = |point: usize| {
             let (middle, plane) = (middles[point].as_ref()?, &self.planes[point]);
-            let covariance =
-                information[point].try_inverse()? + plane * middle.covariance * plane.transpose();
-            covariance.iter().all(|value| value.is_finite()).then(|| covariance.cast())
+            let mut information = Matrix3::zeros();
+            let mut add = |image: ImageId, pixel: Vector2<f64>, noise_px: f64| {
+                let bearing = self.component.images[image.index()].world_from_camera.and_then(|pose| {
+                    let angle = self.component.camera_of(image).pixel_angle(&pixel)?;
+                    let offset = self.component.points[point].position - pose.translation;
+                    Some((offset.try_normalize(0.0)?, noise_px * angle * offset.norm()))
+                });
+                if let Some((direction, sigma)) = bearing {
+                    information +=
+                        (Matrix3::identity() - direction * direction.transpose()) / (sigma * sigma);
+                }
+            };
+            for (at, observation) in self.component.points[point].track.iter().enumerate() {
+                let (pixel, noise_px) = self.place(point, at, aligned[point][at].as_ref(), Some(middle));
+                add(observation.image, pixel, noise_px);
+            }
+            let first = further.partition_point(|found| found.point < point);
+            for found in further[first..].iter().take_while(|found| found.point == point) {
+                add(found.image, found.pixel, found.noise_px);
+            }
+            let covariance = information.try_inverse()? + plane * middle.covariance * plane.transpose();
+            covariance.iter().all(|value: &f64| value.is_finite()).then(|| covariance.cast())
         };
-        (0..aligned.len()).map(covariance).collect()
+        (0..aligned.len()).into_par_iter().map(covariance).collect()
     }
 }
 
@@ -630,12 +635,12 @@ fn store(component: &mut Reconstruction, features: &[&ImageFeatures], problem: &
     for (point, adjusted) in component.points.iter_mut().zip(&problem.points) {
         point.position = adjusted.position;
     }
-    let rays: Vec<Rays> = (component.images.iter().zip(features))
+    let rays: Vec<Rays> = (component.images.par_iter().zip(features))
         .map(|(image, features)| features.rays(&component.cameras[image.camera.index()]))
         .collect();
     let camera_from_world: Vec<Option<Rigid>> =
         component.images.iter().map(|image| Some(image.world_from_camera?.inverse())).collect();
-    for point in &mut component.points {
+    component.points.par_iter_mut().for_each(|point| {
         let squared = |seen: &Observation| {
             let (rays, index) = (&rays[seen.image.index()], seen.feature as usize);
             let in_camera = camera_from_world[seen.image.index()]?.transform_point(&point.position);
@@ -644,7 +649,7 @@ fn store(component: &mut Reconstruction, features: &[&ImageFeatures], problem: &
         };
         let sum: f64 = point.track.iter().filter_map(squared).sum();
         point.error_sigma = (sum / point.track.len().max(1) as f64).sqrt();
-    }
+    });
 }
 
 #[cfg(test)]

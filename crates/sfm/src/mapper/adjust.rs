@@ -1,5 +1,3 @@
-use std::collections::BTreeMap;
-
 use super::model::Model;
 use crate::{
     ImageId, PointId,
@@ -62,7 +60,7 @@ pub(super) fn is_adjustable(model: &Model<'_>, image: ImageId) -> bool {
 /// When every registered image is free the first one is held, which fixes six of the seven gauge freedoms; scale is
 /// left to the damping.
 pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope) -> BundleReport {
-    let mut pose_of_image: BTreeMap<ImageId, u32> = BTreeMap::new();
+    let mut pose_of_image: Vec<Option<u32>> = vec![None; model.poses.len()];
     let mut problem = BundleProblem {
         cameras: model.cameras.clone(),
         camera_freedom: vec![IntrinsicsFreedom::FIXED; model.cameras.len()],
@@ -98,7 +96,7 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
         for &seen in &point.track {
             let Some(pose) = &model.poses[seen.image.index()] else { continue };
             let next = problem.poses.len() as u32;
-            let pose_index = *pose_of_image.entry(seen.image).or_insert_with(|| {
+            let pose_index = *pose_of_image[seen.image.index()].get_or_insert_with(|| {
                 problem.poses.push(BundlePose {
                     camera: model.input.images[seen.image.index()].camera.0,
                     world_from_camera: pose.world_from_camera,
@@ -123,9 +121,9 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
             model.refresh_rays(camera);
         }
     }
-    for (&image, &pose) in &pose_of_image {
-        if free[image.index()] {
-            model.set_pose(image, Some(problem.poses[pose as usize].world_from_camera));
+    for (index, pose) in pose_of_image.into_iter().enumerate() {
+        if let Some(pose) = pose.filter(|_| free[index]) {
+            model.set_pose(ImageId(index as u32), Some(problem.poses[pose as usize].world_from_camera));
         }
     }
     for (id, adjusted) in kept.into_iter().zip(&problem.points) {
