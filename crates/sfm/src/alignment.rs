@@ -195,7 +195,8 @@ fn shares_standpoints(component: &Reconstruction, registered: &[ImageId]) -> boo
 }
 
 /// Templates by point, and where the views show them by point and place in the track.
-type AlignedTracks = (Vec<Option<Template>>, Vec<Vec<Option<Aligned>>>);
+type AlignedTracks = (Templates, Vec<Vec<Option<Aligned>>>);
+type Templates = Vec<Option<Box<Template>>>;
 
 /// A component with what is asked of its tracks.
 struct Tracks<'a> {
@@ -327,7 +328,7 @@ impl<'a> Tracks<'a> {
         load: &(impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync),
     ) -> Result<AlignedTracks, E> {
         let cut = in_each(registered, load, |image, pyramid| self.cut(image, pyramid))?;
-        let mut templates: Vec<Option<Template>> = vec![None; self.component.points.len()];
+        let mut templates: Templates = vec![None; self.component.points.len()];
         for (point, template) in cut.into_iter().flatten() {
             templates[point] = Some(template);
         }
@@ -341,12 +342,12 @@ impl<'a> Tracks<'a> {
     }
 
     /// The patches of the points whose reference this image is, where they have texture.
-    fn cut(&self, image: ImageId, pyramid: &ImagePyramid) -> Vec<(usize, Template)> {
+    fn cut(&self, image: ImageId, pyramid: &ImagePyramid) -> Vec<(usize, Box<Template>)> {
         let own = self.seen[image.index()].iter().filter(|(point, at)| self.references[*point] == *at);
         own.filter_map(|&(point, at)| {
             let frame = self.frame(point, self.component.points[point].track[at])?;
             let patch = Patch::cut(&self.params.patch, pyramid, &frame)?;
-            Some((point, Template::new(&self.params.patch, patch)?))
+            Some((point, Box::new(Template::new(&self.params.patch, patch)?)))
         })
         .collect()
     }
@@ -356,7 +357,7 @@ impl<'a> Tracks<'a> {
         &self,
         image: ImageId,
         pyramid: &ImagePyramid,
-        templates: &[Option<Template>],
+        templates: &[Option<Box<Template>>],
     ) -> Vec<(usize, usize, Aligned)> {
         let others = self.seen[image.index()].iter().filter(|(point, at)| self.references[*point] != *at);
         others
@@ -378,7 +379,7 @@ impl<'a> Tracks<'a> {
         &self,
         image: ImageId,
         pyramid: &ImagePyramid,
-        templates: &[Option<Template>],
+        templates: &[Option<Box<Template>>],
         middles: &[Option<Middle>],
     ) -> Vec<Further> {
         let Some(pose) = self.component.images[image.index()].world_from_camera else { return Vec::new() };

@@ -1,4 +1,3 @@
-use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::Path;
 
@@ -28,12 +27,13 @@ pub fn write_colmap(
         let params: Vec<String> = camera.params.iter().map(f64::to_string).collect();
         writeln!(cameras, "{} {name} {} {} {}", at + 1, camera.width, camera.height, params.join(" "))?;
     }
-    let mut points_of_image: Vec<BTreeMap<u32, usize>> = vec![BTreeMap::new(); model.images.len()];
+    let mut points_of_image: Vec<Vec<(u32, usize)>> = vec![Vec::new(); model.images.len()];
     for (at, point) in model.points.iter().enumerate() {
         for observation in &point.track {
-            points_of_image[observation.image.index()].insert(observation.feature, at + 1);
+            points_of_image[observation.image.index()].push((observation.feature, at + 1));
         }
     }
+    points_of_image.par_iter_mut().for_each(|points| points.sort_unstable());
     let point = |(at, point): (usize, &ReconstructionPoint)| -> Result<String, std::fmt::Error> {
         let (p, [r, g, b]) = (point.position, point.color);
         let mut line = String::new();
@@ -54,9 +54,10 @@ pub fn write_colmap(
         let keypoints = features.get(at).copied().flatten().map_or(&[][..], |features| &features.keypoints);
         for (index, keypoint) in keypoints.iter().enumerate() {
             write!(lines, "{}{} {} ", if index > 0 { " " } else { "" }, keypoint.x, keypoint.y)?;
-            match points_of_image[at].get(&(index as u32)) {
-                Some(point) => write!(lines, "{point}")?,
-                None => lines.push_str("-1"),
+            let points = &points_of_image[at];
+            match points.binary_search_by_key(&(index as u32), |(feature, _)| *feature) {
+                Ok(found) => write!(lines, "{}", points[found].1)?,
+                Err(_) => lines.push_str("-1"),
             }
         }
         lines.push('\n');

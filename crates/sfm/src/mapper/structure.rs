@@ -49,6 +49,9 @@ pub(super) fn triangulate_image(
     let first_new = model.points.len();
     for (feature, mut step) in steps.into_iter().enumerate() {
         let seed = Observation { image, feature: feature as u32 };
+        if model.point_of(seed).is_some() {
+            continue;
+        }
         let is_new =
             |partner: &Observation| model.point_of(*partner).is_some_and(|id| id.index() >= first_new);
         let taken = match &step {
