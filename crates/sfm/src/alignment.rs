@@ -41,9 +41,6 @@ const MIN_COSINE: f64 = 0.5;
 /// Largest factor between the resolutions of a patch in its reference and where it is sought without a keypoint.
 const MAX_ZOOM: f64 = 2.0;
 
-/// Points that an image must share with the reference of a patch to be searched for it: far away in a large scene nothing
-/// is found.
-const MIN_SHARED_POINTS: usize = 12;
 /// Correlation where a patch is expected without a keypoint below which something else is there.
 const MIN_CORRELATION_AT_FIRST: f64 = 0.4;
 
@@ -411,21 +408,23 @@ impl<'a> Tracks<'a> {
         self.others_in_reach(image).into_iter().filter_map(seek).collect()
     }
 
-    /// The points that an image does not see by a keypoint, of references that share points with it; ascending.
+    /// The points that an image does not see by a keypoint, but another that shares points with it does; ascending.
+    ///
+    /// Far away in a large scene nothing would be found.
     fn others_in_reach(&self, image: ImageId) -> Vec<usize> {
-        let mut shared = vec![0_usize; self.seen.len()];
-        let mut is_own = vec![false; self.component.points.len()];
+        let mut is_neighbour = vec![false; self.seen.len()];
+        let mut left_out = vec![false; self.component.points.len()];
         for &(point, _) in &self.seen[image.index()] {
-            is_own[point] = true;
+            left_out[point] = true;
             for seen in &self.component.points[point].track {
-                shared[seen.image.index()] += 1;
+                is_neighbour[seen.image.index()] = true;
             }
         }
-        let neighbours = self.seen.iter().zip(shared).filter(|(_, shared)| *shared >= MIN_SHARED_POINTS);
+        let neighbours = self.seen.iter().zip(is_neighbour).filter(|(_, is_neighbour)| *is_neighbour);
         let mut points: Vec<usize> = neighbours
             .flat_map(|(seen, _)| seen)
-            .filter(|&&(point, at)| self.references[point] == at && !is_own[point])
             .map(|&(point, _)| point)
+            .filter(|&point| !std::mem::replace(&mut left_out[point], true))
             .collect();
         points.sort_unstable();
         points
