@@ -35,4 +35,4 @@ pub use types::{PhotoLocalization, QueryPhoto, Scene, SetLocalization, Verdict};
 ///
 /// 1: single photos, rigid sets, joint refinement. 2: moving scene points, baselines, stricter verdicts. 3: exact scene
 /// points hold still, standpoints move together, no pose without scale. 4: noise as the residuals show it.
-pub const VERSION: u32 = 6;
+pub const VERSION: u32 = 7;

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use anyhow::Result;
+use rayon::prelude::*;
 use setloc_features::ImageFeatures;
 
 use crate::config::Config;
@@ -72,13 +73,14 @@ pub fn build_scene(
         if present == Some(hash) {
             return Ok(BuildOutcome::Unchanged(run.clone(), skipped));
         }
-        let scene = executor.load::<SceneFile>(jobs.scene)?;
-        let mut features = BTreeMap::new();
-        for (image, job) in folder.images.iter().zip(&jobs.features) {
-            if executor.output(*job).is_some() {
-                features.insert(image.name.clone(), executor.load::<ImageFeatures>(*job)?);
-            }
-        }
+        let load_features = || {
+            let made = folder.images.par_iter().zip(&jobs.features);
+            let made = made.filter(|(_, job)| executor.output(**job).is_some());
+            made.map(|(image, job)| Ok((image.name.clone(), executor.load::<ImageFeatures>(*job)?))).collect()
+        };
+        let (scene, features): (_, Result<BTreeMap<_, _>>) =
+            rayon::join(|| executor.load::<SceneFile>(jobs.scene), load_features);
+        let (scene, features) = (scene?, features?);
         Ok(BuildOutcome::Built(Box::new(Built { scene, hash, skipped, features, run: run.clone() })))
     })
 }

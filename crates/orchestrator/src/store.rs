@@ -121,6 +121,21 @@ impl Store {
     /// When the disk is full or not writable.
     pub fn write(&self, fingerprint: &Fingerprint, file: &[u8], cpu_secs: f64) -> Result<ContentHash> {
         let output = ContentHash::of(file);
+        self.keep(fingerprint, output, file, cpu_secs)?;
+        Ok(output)
+    }
+
+    /// As [`Store::write`], with the hash of the file.
+    ///
+    /// # Errors
+    /// When the disk is full or not writable.
+    pub fn keep(
+        &self,
+        fingerprint: &Fingerprint,
+        output: ContentHash,
+        file: &[u8],
+        cpu_secs: f64,
+    ) -> Result<()> {
         let path = self.object_path(output);
         let whole = fs::read(&path).is_ok_and(|old| old == file);
         if !whole {
@@ -128,11 +143,7 @@ impl Store {
         }
         let record =
             KeyRecord { fingerprint: fingerprint.clone(), output, bytes: file.len() as u64, cpu_secs };
-        write_atomically(
-            &self.key_path(fingerprint.key()),
-            serde_json::to_string_pretty(&record)?.as_bytes(),
-        )?;
-        Ok(output)
+        write_atomically(&self.key_path(fingerprint.key()), serde_json::to_string_pretty(&record)?.as_bytes())
     }
 
     /// Removes an artifact, as when it was found damaged.

@@ -14,7 +14,6 @@
 //! Tracks, features and points stay what they are; poses, points and free intrinsics move.
 
 use std::cmp::Ordering;
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, Vector2, Vector3};
@@ -35,12 +34,21 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 4;
+pub const ALIGNMENT_VERSION: u32 = 5;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;
 /// Largest factor between the resolutions of a patch in its reference and where it is sought without a keypoint.
 const MAX_ZOOM: f64 = 2.0;
+
+/// Correlation where a patch is expected without a keypoint below which something else is there.
+const MIN_CORRELATION_AT_FIRST: f64 = 0.4;
+
+/// Relative decrease of the cost at which the adjustment ends that only tells where to look for further views.
+const FIRST_TOLERANCE: f64 = 1e-3;
+/// That of the last adjustment. With a loss that bends so early it approaches its end by small steps: a tenth of this
+/// takes twice as many and leaves the centres where they are, within a hundredth of their error.
+const TOLERANCE: f64 = 1e-5;
 
 /// Standard deviation of the entries of the linear map between two patches, which noise and relief leave.
 const SHAPE_SIGMA: f64 = 0.05;
@@ -122,30 +130,32 @@ pub fn align_tracks<E: Send>(
     // The first alignment tells the slant of the surfaces, the second goes by it.
     let (_, facing) = tracks.align_all(&registered, &load)?;
     tracks.planes = tracks.tilted_planes(&facing);
-    let (patches, aligned) = tracks.align_all(&registered, &load)?;
+    let (templates, aligned) = tracks.align_all(&registered, &load)?;
     let mut report =
         AlignmentReport { aligned: aligned.iter().flatten().flatten().count(), ..AlignmentReport::default() };
     report.points = aligned.iter().filter(|track| track.iter().any(Option::is_some)).count();
-    report.sought = patches
+    report.sought = templates
         .iter()
         .zip(&component.points)
-        .filter(|(patch, _)| patch.is_some())
+        .filter(|(template, _)| template.is_some())
         .map(|(_, point)| point.track.len() - 1)
         .sum();
     let bundle = BundleParams {
         loss: RobustLoss::Cauchy(params.loss_sigma),
         max_iterations: params.max_iterations,
+        function_tolerance: TOLERANCE,
         ..BundleParams::default()
     };
+    let first = BundleParams { function_tolerance: FIRST_TOLERANCE, ..bundle };
     let mut problem = tracks.problem(camera_fixed, &aligned, &tracks.middles(&aligned), &[]);
-    bundle::solve(&bundle, &mut problem);
+    bundle::solve(&first, &mut problem);
     let (references, planes) = (tracks.references, tracks.planes);
     store(component, features, &problem);
     // Now it is known where the patches lie in views that no keypoint ties to them.
     let tracks = Tracks { planes, references, ..Tracks::new(params, component, features) };
     let middles = tracks.middles(&aligned);
     let further = in_each(&registered, &load, |image, pyramid| {
-        tracks.seek_further(image, pyramid, &patches, &middles)
+        tracks.seek_further(image, pyramid, &templates, &middles)
     })?
     .concat();
     report.further = further.len();
@@ -181,8 +191,9 @@ fn shares_standpoints(component: &Reconstruction, registered: &[ImageId]) -> boo
     centers.windows(2).any(|pair| pair[0] == pair[1])
 }
 
-/// Patches by point, and where the views show them by point and place in the track.
-type AlignedTracks = (Vec<Option<Patch>>, Vec<Vec<Option<Aligned>>>);
+/// Templates by point, and where the views show them by point and place in the track.
+type AlignedTracks = (Templates, Vec<Vec<Option<Aligned>>>);
+type Templates = Vec<Option<Box<Template>>>;
 
 /// A component with what is asked of its tracks.
 struct Tracks<'a> {
@@ -295,7 +306,8 @@ impl<'a> Tracks<'a> {
             let (u, v) = tangent_basis(&(normal - plane * slope).try_normalize(0.0)?);
             Some(Matrix3x2::from_columns(&[u, v]))
         };
-        aligned.iter().enumerate().map(|entry| tilted(entry).unwrap_or(self.planes[entry.0])).collect()
+        let points = aligned.par_iter().enumerate();
+        points.map(|entry| tilted(entry).unwrap_or(self.planes[entry.0])).collect()
     }
 
     /// Pixels that a step of a point spans in a view.
@@ -313,25 +325,26 @@ impl<'a> Tracks<'a> {
         load: &(impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync),
     ) -> Result<AlignedTracks, E> {
         let cut = in_each(registered, load, |image, pyramid| self.cut(image, pyramid))?;
-        let mut patches: Vec<Option<Patch>> = vec![None; self.component.points.len()];
-        for (point, patch) in cut.into_iter().flatten() {
-            patches[point] = Some(patch);
+        let mut templates: Templates = vec![None; self.component.points.len()];
+        for (point, template) in cut.into_iter().flatten() {
+            templates[point] = Some(template);
         }
-        let found = in_each(registered, load, |image, pyramid| self.align(image, pyramid, &patches))?;
+        let found = in_each(registered, load, |image, pyramid| self.align(image, pyramid, &templates))?;
         let mut aligned: Vec<Vec<Option<Aligned>>> =
             self.component.points.iter().map(|point| vec![None; point.track.len()]).collect();
         for (point, at, place) in found.into_iter().flatten() {
             aligned[point][at] = Some(place);
         }
-        Ok((patches, aligned))
+        Ok((templates, aligned))
     }
 
-    /// The patches of the points whose reference this image is.
-    fn cut(&self, image: ImageId, pyramid: &ImagePyramid) -> Vec<(usize, Patch)> {
+    /// The patches of the points whose reference this image is, where they have texture.
+    fn cut(&self, image: ImageId, pyramid: &ImagePyramid) -> Vec<(usize, Box<Template>)> {
         let own = self.seen[image.index()].iter().filter(|(point, at)| self.references[*point] == *at);
         own.filter_map(|&(point, at)| {
             let frame = self.frame(point, self.component.points[point].track[at])?;
-            Some((point, Patch::cut(&self.params.patch, pyramid, &frame)?))
+            let patch = Patch::cut(&self.params.patch, pyramid, &frame)?;
+            Some((point, Box::new(Template::new(&self.params.patch, patch)?)))
         })
         .collect()
     }
@@ -341,15 +354,15 @@ impl<'a> Tracks<'a> {
         &self,
         image: ImageId,
         pyramid: &ImagePyramid,
-        patches: &[Option<Patch>],
+        templates: &[Option<Box<Template>>],
     ) -> Vec<(usize, usize, Aligned)> {
         let others = self.seen[image.index()].iter().filter(|(point, at)| self.references[*point] != *at);
         others
             .filter_map(|&(point, at)| {
                 let observation = self.component.points[point].track[at];
+                let template = templates[point].as_ref()?;
                 let frame = self.frame(point, observation)?;
-                let aligned =
-                    Template::new(&self.params.patch, patches[point].as_ref()?)?.align(pyramid, &frame)?;
+                let aligned = template.align(pyramid, &frame, -1.0)?;
                 let limit = self.params.max_shift_sigma * f64::from(self.keypoint(observation).noise_px);
                 ((aligned.pixel - frame.center).norm() <= limit).then_some((point, at, aligned))
             })
@@ -363,13 +376,12 @@ impl<'a> Tracks<'a> {
         &self,
         image: ImageId,
         pyramid: &ImagePyramid,
-        patches: &[Option<Patch>],
+        templates: &[Option<Box<Template>>],
         middles: &[Option<Middle>],
     ) -> Vec<Further> {
         let Some(pose) = self.component.images[image.index()].world_from_camera else { return Vec::new() };
-        let own: BTreeSet<usize> = self.seen[image.index()].iter().map(|&(point, _)| point).collect();
         let seek = |point: usize| {
-            let (patch, middle) = (patches[point].as_ref()?, middles[point].as_ref()?);
+            let (template, middle) = (templates[point].as_ref()?, middles[point].as_ref()?);
             let position = self.component.points[point].position;
             let reference = self.component.points[point].track[self.references[point]];
             let sight = (pose.translation - position).try_normalize(0.0)?;
@@ -387,7 +399,7 @@ impl<'a> Tracks<'a> {
                 return None;
             }
             let frame = self.frame_at(point, image, center, &pixel_from_plane)?;
-            let aligned = Template::new(&self.params.patch, patch)?.align(pyramid, &frame)?;
+            let aligned = template.align(pyramid, &frame, MIN_CORRELATION_AT_FIRST)?;
             let limit = self.params.max_shift_sigma * f64::from(self.keypoint(reference).noise_px) * zoom;
             let noise_px = self.noise_px(&aligned);
             let pixel = aligned.pixel + pixel_from_plane * middle.offset;
@@ -397,7 +409,29 @@ impl<'a> Tracks<'a> {
                 place: Place { pixel, noise_px },
             })
         };
-        (0..self.component.points.len()).filter(|point| !own.contains(point)).filter_map(seek).collect()
+        self.others_in_reach(image).into_iter().filter_map(seek).collect()
+    }
+
+    /// The points that an image does not see by a keypoint, but another that shares points with it does; ascending.
+    ///
+    /// Far away in a large scene nothing would be found.
+    fn others_in_reach(&self, image: ImageId) -> Vec<usize> {
+        let mut is_neighbour = vec![false; self.seen.len()];
+        let mut left_out = vec![false; self.component.points.len()];
+        for &(point, _) in &self.seen[image.index()] {
+            left_out[point] = true;
+            for seen in &self.component.points[point].track {
+                is_neighbour[seen.image.index()] = true;
+            }
+        }
+        let neighbours = self.seen.iter().zip(is_neighbour).filter(|(_, is_neighbour)| *is_neighbour);
+        let mut points: Vec<usize> = neighbours
+            .flat_map(|(seen, _)| seen)
+            .map(|&(point, _)| point)
+            .filter(|&point| !std::mem::replace(&mut left_out[point], true))
+            .collect();
+        points.sort_unstable();
+        points
     }
 
     fn noise_px(&self, aligned: &Aligned) -> f64 {
@@ -433,15 +467,19 @@ impl<'a> Tracks<'a> {
                 *freedom = IntrinsicsFreedom::LENS;
             }
         }
-        for (index, point) in component.points.iter().enumerate() {
-            problem.points.push(BundlePoint { position: point.position, fixed: false });
-            for (at, seen) in point.track.iter().enumerate() {
-                let Some(pose) = pose_of_image[seen.image.index()] else { continue };
-                let Place { pixel, noise_px } =
-                    self.place(index, at, aligned[index][at].as_ref(), middles[index].as_ref());
-                problem.observations.push(BundleObservation { pose, point: index as u32, pixel, noise_px });
-            }
-        }
+        let points = component.points.iter();
+        problem.points = points.map(|point| BundlePoint { position: point.position, fixed: false }).collect();
+        let observation = |point: usize, at: usize| {
+            let seen = component.points[point].track[at];
+            let pose = pose_of_image[seen.image.index()]?;
+            let Place { pixel, noise_px } =
+                self.place(point, at, aligned[point][at].as_ref(), middles[point].as_ref());
+            Some(BundleObservation { pose, point: point as u32, pixel, noise_px })
+        };
+        let points = component.points.par_iter().enumerate();
+        problem.observations = points
+            .flat_map_iter(|(point, seen)| (0..seen.track.len()).filter_map(move |at| observation(point, at)))
+            .collect();
         problem.observations.extend(further.iter().filter_map(|found| {
             let &Further { point, image, place: Place { pixel, noise_px } } = found;
             let pose = pose_of_image[image.index()]?;
@@ -471,7 +509,7 @@ impl<'a> Tracks<'a> {
     }
 
     fn middles(&self, aligned: &[Vec<Option<Aligned>>]) -> Vec<Option<Middle>> {
-        aligned.iter().enumerate().map(|(point, aligned)| self.middle(point, aligned)).collect()
+        aligned.par_iter().enumerate().map(|(point, aligned)| self.middle(point, aligned)).collect()
     }
 
     /// Where the keypoints of a point lie in the mean; `None` when none was aligned with another.
@@ -524,7 +562,7 @@ impl<'a> Tracks<'a> {
             let aligned = AlignedTrack { places, further, spot: spot.cast() };
             covariance.iter().all(|value| value.is_finite()).then(|| (aligned, covariance.cast()))
         };
-        further_of.into_iter().enumerate().map(placed).collect()
+        further_of.into_par_iter().enumerate().map(placed).collect()
     }
 
     /// What a view says of the place of a point.
@@ -596,12 +634,12 @@ fn store(component: &mut Reconstruction, features: &[&ImageFeatures], problem: &
     for (point, adjusted) in component.points.iter_mut().zip(&problem.points) {
         point.position = adjusted.position;
     }
-    let rays: Vec<Rays> = (component.images.iter().zip(features))
+    let rays: Vec<Rays> = (component.images.par_iter().zip(features))
         .map(|(image, features)| features.rays(&component.cameras[image.camera.index()]))
         .collect();
     let camera_from_world: Vec<Option<Rigid>> =
         component.images.iter().map(|image| Some(image.world_from_camera?.inverse())).collect();
-    for point in &mut component.points {
+    component.points.par_iter_mut().for_each(|point| {
         let squared = |seen: &Observation| {
             let (rays, index) = (&rays[seen.image.index()], seen.feature as usize);
             let in_camera = camera_from_world[seen.image.index()]?.transform_point(&point.position);
@@ -610,7 +648,7 @@ fn store(component: &mut Reconstruction, features: &[&ImageFeatures], problem: &
         };
         let sum: f64 = point.track.iter().filter_map(squared).sum();
         point.error_sigma = (sum / point.track.len().max(1) as f64).sqrt();
-    }
+    });
 }
 
 #[cfg(test)]

@@ -12,6 +12,7 @@ mod structure;
 use std::collections::BTreeMap;
 
 use nalgebra::{UnitQuaternion, Vector3};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, ImageFeatures, Match};
 
@@ -23,8 +24,8 @@ use self::{
     correspondence::CorrespondenceGraph,
     model::Model,
     register::{
-        PoseHypothesis, Visibility, hypothesize, hypothesize_baseline, hypothesize_from_pairs, register,
-        scene_matches, visibility,
+        PoseHypothesis, Visibility, count_scene_matches, hypothesize, hypothesize_baseline,
+        hypothesize_from_pairs, register, visibility,
     },
     standpoint::Standpoints,
     structure::{PointLimits, complete_and_merge, filter, triangulate_image},
@@ -36,7 +37,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 5;
+pub const MAPPER_VERSION: u32 = 6;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -196,6 +197,21 @@ pub struct RegistrationRecord {
     pub matched_cells: usize,
 }
 
+impl RegistrationRecord {
+    fn new(image: ImageId, accepted: bool, [candidates, inliers]: [usize; 2], seen: &Visibility) -> Self {
+        Self {
+            image,
+            accepted,
+            candidates,
+            inliers,
+            expected: seen.expected,
+            matched: seen.matched,
+            expected_cells: seen.expected_cells,
+            matched_cells: seen.matched_cells,
+        }
+    }
+}
+
 /// What happened, for people.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct MapperReport {
@@ -306,7 +322,7 @@ impl<'a> Mapper<'a> {
             self.model.set_pose(second, Some(pair.two_view.second_from_first.inverse()));
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), first);
             self.adjust_all(30);
-            filter(&mut self.model, self.params.limits());
+            self.filter_all();
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), first);
             if self.model.observed_points(first) >= self.params.min_initial_points {
                 return true;
@@ -332,8 +348,10 @@ impl<'a> Mapper<'a> {
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), image);
             let scope = Scope::local(&self.model, image, self.params.local_bundle_images);
             adjust(&mut self.model, &self.params.bundle(10), &scope);
-            self.follow_anchors();
-            filter(&mut self.model, self.params.limits());
+            let mut moved = self.follow_anchors();
+            moved.extend(scope.free_images);
+            let points = self.model.seen_by(&moved);
+            filter(&mut self.model, self.params.limits(), &points);
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), image);
             let count = self.model.registered_count();
             if count as f64 >= self.images_at_last_global as f64 * self.params.global_bundle_growth
@@ -408,7 +426,10 @@ impl<'a> Mapper<'a> {
             }
         }
         let (_, image, pose) = best?;
-        let pose = self.first_accepted(image, vec![pose])?;
+        let mut records = Vec::new();
+        let pose = self.first_accepted(image, vec![pose], &mut records);
+        self.records.append(&mut records);
+        let pose = pose?;
         register(&mut self.model, image, &pose);
         Some(image)
     }
@@ -423,21 +444,31 @@ impl<'a> Mapper<'a> {
         }
     }
 
-    /// Images with too few points to be adjusted stay with the image that they were turned from.
-    fn follow_anchors(&mut self) {
-        for image in self.model.registered().collect::<Vec<_>>() {
-            if self.anchors[image.index()].is_some() && !is_adjustable(&self.model, image) {
-                self.place_by_turn(image);
-            }
+    /// Images with too few points to be adjusted stay with the image that they were turned from. Returns those moved.
+    fn follow_anchors(&mut self) -> Vec<ImageId> {
+        let follows =
+            |image: &ImageId| self.anchors[image.index()].is_some() && !is_adjustable(&self.model, *image);
+        let followers: Vec<ImageId> = self.model.registered().filter(follows).collect();
+        for &image in &followers {
+            self.place_by_turn(image);
         }
+        followers
+    }
+
+    fn filter_all(&mut self) -> usize {
+        let points = self.model.live_ids();
+        filter(&mut self.model, self.params.limits(), &points)
     }
 
     /// The image to register next: the best supported acceptable pose among the few with most matches.
     fn next_image(&mut self) -> Option<(ImageId, PoseHypothesis)> {
-        let mut waiting: Vec<(usize, ImageId)> = (0..self.model.poses.len() as u32)
+        let open: Vec<ImageId> = (0..self.model.poses.len() as u32)
             .map(ImageId)
             .filter(|&image| !self.model.is_registered(image) && !self.taken[image.index()])
-            .map(|image| (scene_matches(&self.model, &self.graph, image).len(), image))
+            .collect();
+        let mut waiting: Vec<(usize, ImageId)> = open
+            .into_par_iter()
+            .map(|image| (count_scene_matches(&self.model, &self.graph, image), image))
             .filter(|&(count, image)| {
                 count >= self.params.min_confirmed_inliers.min(self.params.min_registration_inliers)
                     && count > self.refused_at[image.index()] * 11 / 10
@@ -445,28 +476,36 @@ impl<'a> Mapper<'a> {
             .collect();
         waiting.sort_by_key(|&(count, image)| (std::cmp::Reverse(count), image));
         let mut best: Option<(ImageId, PoseHypothesis)> = None;
-        for (tried, (count, image)) in waiting.into_iter().enumerate() {
-            if tried >= 3 && best.is_some() {
-                break;
-            }
-            match self.acceptable_pose(image) {
-                Some(hypothesis) => {
-                    if best.as_ref().is_none_or(|(_, other)| hypothesis.inliers.len() > other.inliers.len()) {
-                        best = Some((image, hypothesis));
+        // The first few in any case, the others until one is acceptable.
+        let (few, others) = waiting.split_at(waiting.len().min(3));
+        for tried in std::iter::once(few).chain(others.chunks(2)) {
+            let poses: Vec<_> = tried.par_iter().map(|&(_, image)| self.acceptable_pose(image)).collect();
+            for (&(count, image), (pose, mut records)) in tried.iter().zip(poses) {
+                self.records.append(&mut records);
+                match pose {
+                    Some(pose) => {
+                        if best.as_ref().is_none_or(|(_, other)| pose.inliers.len() > other.inliers.len()) {
+                            best = Some((image, pose));
+                        }
                     }
+                    None => self.refused_at[image.index()] = count,
                 }
-                None => self.refused_at[image.index()] = count,
+            }
+            if best.is_some() {
+                break;
             }
         }
         best
     }
 
-    fn acceptable_pose(&mut self, image: ImageId) -> Option<PoseHypothesis> {
+    /// A pose that may be taken, and what was thought of it and those before.
+    fn acceptable_pose(&self, image: ImageId) -> (Option<PoseHypothesis>, Vec<RegistrationRecord>) {
+        let mut records = Vec::new();
         let seed = self.seed ^ (u64::from(image.0) << 32);
         let ransac = self.params.ransac();
         let resected =
             hypothesize(&self.model, &self.graph, image, &ransac, self.params.max_pose_hypotheses, seed);
-        self.first_accepted(image, resected).or_else(|| {
+        let pose = self.first_accepted(image, resected, &mut records).or_else(|| {
             let confirmed = RansacParams { min_inliers: self.params.min_confirmed_inliers, ..ransac };
             let mut from_pairs = hypothesize_from_pairs(&self.model, &self.graph, image, &confirmed);
             from_pairs.retain(|pose| {
@@ -474,11 +513,17 @@ impl<'a> Mapper<'a> {
                     || pose.inliers.len() >= self.params.min_registration_inliers
             });
             from_pairs.truncate(self.params.max_pose_hypotheses);
-            self.first_accepted(image, from_pairs)
-        })
+            self.first_accepted(image, from_pairs, &mut records)
+        });
+        (pose, records)
     }
 
-    fn first_accepted(&mut self, image: ImageId, hypotheses: Vec<PoseHypothesis>) -> Option<PoseHypothesis> {
+    fn first_accepted(
+        &self,
+        image: ImageId,
+        hypotheses: Vec<PoseHypothesis>,
+        records: &mut Vec<RegistrationRecord>,
+    ) -> Option<PoseHypothesis> {
         let mut refused_before = false;
         for hypothesis in hypotheses {
             let seen = hypothesis.visibility;
@@ -489,16 +534,8 @@ impl<'a> Mapper<'a> {
             let accepted = plausible
                 && self.pair_agreement(image, &hypothesis.world_from_camera)
                     >= self.params.min_pair_agreement;
-            self.records.push(RegistrationRecord {
-                image,
-                accepted,
-                candidates: hypothesis.candidates,
-                inliers: hypothesis.inliers.len(),
-                expected: seen.expected,
-                matched: seen.matched,
-                expected_cells: seen.expected_cells,
-                matched_cells: seen.matched_cells,
-            });
+            let (candidates, inliers) = (hypothesis.candidates, hypothesis.inliers.len());
+            records.push(RegistrationRecord::new(image, accepted, [candidates, inliers], &seen));
             if accepted {
                 return Some(hypothesis);
             }
@@ -536,30 +573,32 @@ impl<'a> Mapper<'a> {
     /// of the place have been mapped. It is offered again when more of the model can be matched to it.
     fn expel_misplaced(&mut self) -> usize {
         let mut expelled = 0;
-        for image in self.model.registered().collect::<Vec<_>>() {
-            if self.model.registered_count() <= 3 {
-                break;
-            }
-            let Some(pose) = self.model.poses[image.index()] else { continue };
-            let seen =
-                visibility(&self.model, image, &pose.world_from_camera, &self.model.observations_of(image));
-            if seen.expected >= self.params.min_visible_points && !self.is_recognized(&seen) {
-                self.records.push(RegistrationRecord {
-                    image,
-                    accepted: false,
-                    candidates: self.model.observed_points(image),
-                    inliers: self.model.observed_points(image),
-                    expected: seen.expected,
-                    matched: seen.matched,
-                    expected_cells: seen.expected_cells,
-                    matched_cells: seen.matched_cells,
-                });
-                self.model.unregister(image);
-                self.refused_at[image.index()] = scene_matches(&self.model, &self.graph, image).len();
-                expelled += 1;
-            }
+        let mut waiting: Vec<ImageId> = self.model.registered().collect();
+        // Who is taken out changes what those after it ought to see.
+        while let Some((at, seen)) = self.first_misplaced(&waiting) {
+            let image = waiting[at];
+            let points = self.model.observed_points(image);
+            self.records.push(RegistrationRecord::new(image, false, [points, points], &seen));
+            self.model.unregister(image);
+            self.refused_at[image.index()] = count_scene_matches(&self.model, &self.graph, image);
+            expelled += 1;
+            waiting.drain(..=at);
         }
         expelled
+    }
+
+    /// The place of the first of these images that does not see what it ought to.
+    fn first_misplaced(&self, images: &[ImageId]) -> Option<(usize, Visibility)> {
+        if self.model.registered_count() <= 3 {
+            return None;
+        }
+        let misplaced = |(at, &image): (usize, &ImageId)| {
+            let pose = self.model.poses[image.index()]?.world_from_camera;
+            let seen = visibility(&self.model, image, &pose, &self.model.observations_of(image));
+            let judged = seen.expected >= self.params.min_visible_points;
+            (judged && !self.is_recognized(&seen)).then_some((at, seen))
+        };
+        images.par_iter().enumerate().find_map_first(misplaced)
     }
 
     fn adjust_all(&mut self, max_iterations: u32) {
@@ -574,7 +613,7 @@ impl<'a> Mapper<'a> {
             let observations: usize = self.model.live_points().map(|(_, point)| point.track.len()).sum();
             self.adjust_all(max_iterations);
             let limits = self.params.limits();
-            let mut changes = filter(&mut self.model, limits);
+            let mut changes = self.filter_all();
             let before: usize = self.model.live_points().count();
             for image in self.model.registered().collect::<Vec<_>>() {
                 triangulate_image(&mut self.model, &self.graph, limits, image);
@@ -598,6 +637,6 @@ impl<'a> Mapper<'a> {
         }
         self.refine(4, 20);
         self.adjust_all(30);
-        filter(&mut self.model, self.params.limits());
+        self.filter_all();
     }
 }

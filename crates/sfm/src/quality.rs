@@ -1,8 +1,11 @@
 //! The quality gate: what in a finished model disagrees with its own evidence.
 
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::{ImageId, PairGeometry, Reconstruction, TwoViewKind, visibility::is_same_view};
+use crate::{
+    ImageId, PairGeometry, Reconstruction, ReconstructionPoint, TwoViewKind, visibility::is_same_view,
+};
 
 /// When to speak up.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -77,6 +80,19 @@ pub struct QualityReport {
     pub weak_images: Vec<(ImageId, usize)>,
 }
 
+/// Tasks that the points are counted in; each needs memory for all pairs of images.
+const TASKS: usize = 4;
+
+/// What some of the points count for.
+struct Counts {
+    /// Points that both of two images see, by pair.
+    shared: Vec<u32>,
+    /// Points of the first that the second ought to see, by pair.
+    expected: Vec<u32>,
+    /// By image.
+    points_of: Vec<u32>,
+}
+
 /// Compares a component with the verified pairs it was built from.
 pub fn assess(
     params: &QualityParams,
@@ -89,35 +105,48 @@ pub fn assess(
         images: n,
         ..QualityReport::default()
     };
-    let mut shared = vec![0_usize; n * n];
-    let mut expected = vec![0_usize; n * n];
-    let mut points_of = vec![0_usize; n];
-    let mut sees = vec![false; n];
     let center =
         |image: ImageId| reconstruction.images[image.index()].world_from_camera.map(|pose| pose.translation);
-    for point in &reconstruction.points {
-        for seen in &point.track {
-            sees[seen.image.index()] = true;
-            points_of[seen.image.index()] += 1;
-        }
-        for seen in &point.track {
-            let Some(observer) = center(seen.image) else { continue };
-            for other in reconstruction.registered().filter(|&other| other != seen.image) {
-                let Some(candidate) = center(other) else { continue };
-                let cell = seen.image.index() * n + other.index();
-                let in_view = reconstruction.camera_of(other).is_panoramic();
-                if sees[other.index()] {
-                    shared[cell] += 1;
-                }
-                if in_view && is_same_view(&point.position, &observer, &candidate) {
-                    expected[cell] += 1;
+    let count = |points: &[ReconstructionPoint]| {
+        let mut counts = Counts { shared: vec![0; n * n], expected: vec![0; n * n], points_of: vec![0; n] };
+        let mut sees = vec![false; n];
+        for point in points {
+            for seen in &point.track {
+                sees[seen.image.index()] = true;
+                counts.points_of[seen.image.index()] += 1;
+            }
+            for seen in &point.track {
+                let Some(observer) = center(seen.image) else { continue };
+                for other in reconstruction.registered().filter(|&other| other != seen.image) {
+                    let Some(candidate) = center(other) else { continue };
+                    let cell = seen.image.index() * n + other.index();
+                    let in_view = reconstruction.camera_of(other).is_panoramic();
+                    if sees[other.index()] {
+                        counts.shared[cell] += 1;
+                    }
+                    if in_view && is_same_view(&point.position, &observer, &candidate) {
+                        counts.expected[cell] += 1;
+                    }
                 }
             }
+            for seen in &point.track {
+                sees[seen.image.index()] = false;
+            }
         }
-        for seen in &point.track {
-            sees[seen.image.index()] = false;
+        counts
+    };
+    let share = reconstruction.points.len().div_ceil(TASKS).max(1);
+    let parts: Vec<Counts> = reconstruction.points.par_chunks(share).map(count).collect();
+    let sum = |of: fn(&Counts) -> &[u32], len: usize| {
+        let mut sums = vec![0_usize; len];
+        for part in &parts {
+            sums.iter_mut().zip(of(part)).for_each(|(sum, value)| *sum += *value as usize);
         }
-    }
+        sums
+    };
+    let shared = sum(|counts| &counts.shared, n * n);
+    let expected = sum(|counts| &counts.expected, n * n);
+    let points_of = sum(|counts| &counts.points_of, n);
     for pair in pairs {
         let poses = (
             reconstruction.images[pair.first.index()].world_from_camera,

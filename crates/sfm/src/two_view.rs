@@ -10,6 +10,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another geometry.
+pub const TWO_VIEW_VERSION: u32 = 3;
 
 /// How to verify a pair.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

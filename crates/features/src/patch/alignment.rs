@@ -2,8 +2,14 @@ use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 use serde::{Deserialize, Serialize};
 
 use super::ImagePyramid;
+use super::pyramid::{Grid, Quadratic, Samples};
 use crate::FeatureError;
 use crate::error::check;
+
+/// Largest radius of a patch.
+const MAX_RADIUS: usize = 50;
+/// Its samples in a row.
+const MAX_ACROSS: usize = 2 * MAX_RADIUS + 1;
 
 /// How patches are aligned.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -31,7 +37,7 @@ impl PatchParams {
     /// # Errors
     /// [`FeatureError::InvalidParameter`] with the value at fault.
     pub fn validate(&self) -> Result<(), FeatureError> {
-        check("radius", self.radius as f64, "2 to 50", (2..=50).contains(&self.radius))?;
+        check("radius", self.radius as f64, "2 to 50", (2..=MAX_RADIUS).contains(&self.radius))?;
         check(
             "min_correlation",
             self.min_correlation,
@@ -62,6 +68,24 @@ impl PatchFrame {
     fn pixel(&self, q: &Vector2<f64>) -> Vector2<f64> {
         let bend = self.curvature.map(|curvature| 0.5 * q.dot(&(curvature * q)));
         self.center + self.pixel_from_patch * q + Vector2::from(bend)
+    }
+
+    /// The pixels of the samples q after the map q ↦ `shape`·q + `shift`.
+    fn grid(&self, shape: &Matrix2<f64>, shift: &Vector2<f64>) -> Grid {
+        let center = self.pixel(shift);
+        let bend = self.curvature.map(|curvature| shape.transpose() * curvature);
+        let linear = self.pixel_from_patch * shape;
+        Grid([0, 1].map(|axis| {
+            let by_q = linear.row(axis).transpose() + bend[axis] * shift;
+            let by_qq = 0.5 * bend[axis] * shape;
+            let mixed = by_qq[(0, 1)] + by_qq[(1, 0)];
+            Quadratic {
+                constant: center[axis],
+                linear: by_q.into(),
+                square: [by_qq[(0, 0)], by_qq[(1, 1)]],
+                mixed,
+            }
+        }))
     }
 
     /// Pixels that one step spans: the geometric mean over all directions.
@@ -109,13 +133,11 @@ pub struct Patch {
 impl Patch {
     /// Samples a patch; `None` when it leaves the image.
     pub fn cut(params: &PatchParams, pyramid: &ImagePyramid, frame: &PatchFrame) -> Option<Self> {
-        let reach = params.radius as isize + 1;
-        let pixels = (-reach..=reach).flat_map(|y| {
-            (-reach..=reach).map(move |x| frame.pixel(&Vector2::new(x as f64, y as f64)).cast())
-        });
-        let mut samples = Vec::with_capacity((2 * params.radius + 3).pow(2));
-        let inside = pyramid.sample(pyramid.level_for(frame.spacing()), pixels, &mut samples);
-        inside.then_some(Self { radius: params.radius, samples })
+        let grid = frame.grid(&Matrix2::identity(), &Vector2::zeros());
+        let mut samples = Samples::default();
+        let level = pyramid.level_for(frame.spacing());
+        let inside = pyramid.sample(level, &grid, params.radius + 1, &mut samples);
+        inside.then_some(Self { radius: params.radius, samples: samples.values })
     }
 }
 
@@ -125,91 +147,97 @@ impl Patch {
 /// an affine map with gain and offset: I(center + A·W(q)) ≈ gain·T(q) + offset, W(q) = B·q + t. In each step
 /// θ = (JᵀΩJ)⁻¹JᵀΩ·I gives gain, offset and gain·(δt, δB) at once, with J = (T_x, T_y, T_x·q, T_y·q, T, 1) and a
 /// Gaussian window Ω; then W ← W ∘ (q ↦ q + δB·q + δt)⁻¹.
+///
+/// Kept are the samples only (a kilobyte or two): J and Ω follow from them faster than memory gives them back.
 #[derive(Debug, Clone)]
 pub struct Template {
     params: PatchParams,
-    /// q of every sample.
-    offsets: Vec<Vector2<f64>>,
-    values: Vec<f32>,
-    /// Ω, of sum one.
-    weights: Vec<f32>,
-    /// J, row by row.
-    jacobian: Vec<[f32; UNKNOWNS]>,
-    /// Rows of (JᵀΩJ)⁻¹JᵀΩ, one sample after the other.
-    solve: Vec<[f32; UNKNOWNS]>,
-    /// Covariance of the shift for samples of unit variance.
-    shift_covariance: Matrix2<f64>,
+    radius: usize,
+    /// T without its mean, with one more sample on each side.
+    samples: Vec<f32>,
+    /// What was taken off: the mean under Ω.
+    mean: f32,
+    /// Variance of T under Ω.
+    variance: f64,
+    /// (JᵀΩJ)⁻¹.
+    inverse: SMatrix<f64, UNKNOWNS, UNKNOWNS>,
+    /// Trace of the covariance of the shift for samples of unit variance.
+    shift_variance: f64,
+}
+
+/// A least-squares fit of a template to the samples of an image.
+struct Fit {
+    theta: SVector<f64, UNKNOWNS>,
+    /// Mean squared difference that remains, under Ω.
+    remaining: f64,
+    correlation: f64,
 }
 
 impl Template {
     /// Prepares a patch; `None` when it has too little texture to be placed.
-    pub fn new(params: &PatchParams, patch: &Patch) -> Option<Self> {
-        let Patch { radius, samples } = patch;
-        let (side, radius) = (2 * radius + 3, *radius as isize);
-        let (mut offsets, mut values, mut weights, mut jacobian) =
-            (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        let falloff = -0.5 / (WINDOW * radius as f64).powi(2);
-        for y in -radius..=radius {
-            for x in -radius..=radius {
-                let at = (y + radius + 1) as usize * side + (x + radius + 1) as usize;
-                let value = samples[at];
-                let (dx, dy) = (
-                    0.5 * (samples[at + 1] - samples[at - 1]),
-                    0.5 * (samples[at + side] - samples[at - side]),
-                );
-                let q = Vector2::new(x as f64, y as f64);
-                let [qx, qy] = [x as f32, y as f32];
-                weights.push((falloff * (x * x + y * y) as f64).exp() as f32);
-                jacobian.push([dx, dy, dx * qx, dx * qy, dy * qx, dy * qy, value, 1.0]);
-                offsets.push(q);
-                values.push(value);
-            }
+    pub fn new(params: &PatchParams, patch: Patch) -> Option<Self> {
+        let Patch { radius, mut samples } = patch;
+        let (side, window) = (2 * radius + 3, window(radius));
+        let mut mean = 0.0;
+        for (y, wy) in window.iter().enumerate() {
+            let row = &samples[(y + 1) * side + 1..];
+            mean += wy * window.iter().zip(row).map(|(wx, value)| wx * value).sum::<f32>();
         }
-        let sum: f32 = weights.iter().sum();
-        for weight in &mut weights {
-            *weight /= sum;
+        for sample in &mut samples {
+            *sample -= mean;
         }
         let mut curvature = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::zeros();
         // For the covariance of a weighted fit: JᵀΩ²J.
         let mut spread = curvature;
-        for (row, &weight) in jacobian.iter().zip(&weights) {
-            let row = SVector::<f64, UNKNOWNS>::from_fn(|i, _| f64::from(row[i]));
-            let weight = f64::from(weight);
-            let outer = row * (row * weight).transpose();
-            curvature += outer;
-            spread += outer * weight;
+        for (y, wy) in window.iter().enumerate() {
+            let qy = y as f64 - radius as f64;
+            for (x, wx) in window.iter().enumerate() {
+                let (qx, at) = (x as f64 - radius as f64, (y + 1) * side + x + 1);
+                let dx = 0.5 * f64::from(samples[at + 1] - samples[at - 1]);
+                let dy = 0.5 * f64::from(samples[at + side] - samples[at - side]);
+                let value = f64::from(samples[at]);
+                let row = [dx, dy, dx * qx, dx * qy, dy * qx, dy * qy, value, 1.0];
+                let weight = f64::from(wx * wy);
+                for column in 0..UNKNOWNS {
+                    let weighted = weight * row[column];
+                    for i in column..UNKNOWNS {
+                        let product = row[i] * weighted;
+                        curvature[(i, column)] += product;
+                        spread[(i, column)] += product * weight;
+                    }
+                }
+            }
         }
+        curvature.fill_upper_triangle_with_lower_triangle();
+        spread.fill_upper_triangle_with_lower_triangle();
         let texture = curvature.fixed_view::<2, 2>(0, 0).into_owned();
         let flat = texture.symmetric_eigenvalues().min() <= SINGULAR * curvature.trace();
         let inverse = curvature.cholesky().filter(|_| !flat)?.inverse();
-        let solve = jacobian
-            .iter()
-            .zip(&weights)
-            .map(|(row, &weight)| {
-                let row = SVector::<f64, UNKNOWNS>::from_fn(|i, _| f64::from(row[i]));
-                let column = inverse * row * f64::from(weight);
-                std::array::from_fn(|i| column[i] as f32)
-            })
-            .collect();
-        let covariance = inverse * spread * inverse;
-        let shift_covariance = covariance.fixed_view::<2, 2>(0, 0).into_owned();
-        Some(Self { params: *params, offsets, values, weights, jacobian, solve, shift_covariance })
+        let shift = inverse.fixed_rows::<2>(0);
+        let shift_variance = (shift * spread * shift.transpose()).trace();
+        let variance = curvature[(6, 6)];
+        Some(Self { params: *params, radius, samples, mean, variance, inverse, shift_variance })
     }
 
     /// Finds the template near the middle of `frame`, which also gives the expected shape; `None` where it is not.
     ///
-    /// The shift is not bounded: whether it is plausible depends on how well the place was known.
-    pub fn align(&self, pyramid: &ImagePyramid, frame: &PatchFrame) -> Option<Aligned> {
+    /// The shift is not bounded: whether it is plausible depends on how well the place was known. Where the first
+    /// look correlates by less than `least_at_first`, nothing is sought; -1 seeks in any case.
+    pub fn align(&self, pyramid: &ImagePyramid, frame: &PatchFrame, least_at_first: f64) -> Option<Aligned> {
         let level = pyramid.level_for(frame.spacing());
         let (mut shape, mut shift) = (Matrix2::identity(), Vector2::zeros());
-        let mut values = Vec::with_capacity(self.offsets.len());
+        let (window, mut samples) = (window(self.radius), Samples::default());
+        let mut fit = |shape: &Matrix2<f64>, shift: &Vector2<f64>| {
+            let inside = pyramid.sample(level, &frame.grid(shape, shift), self.radius, &mut samples);
+            inside.then(|| self.fit(&window, &samples.values))
+        };
+        let mut found = fit(&shape, &shift).filter(|first| first.correlation >= least_at_first)?;
         for _ in 0..self.params.max_iterations {
-            let fitted = self.fit(pyramid, level, frame, &shape, &shift, &mut values)?;
-            let gain = fitted[6];
+            let gain = found.theta[6];
             if !(MIN_GAIN..=1.0 / MIN_GAIN).contains(&gain) {
                 return None;
             }
-            let step = fitted / gain;
+            let step = found.theta / gain;
             let turned = Matrix2::new(1.0 + step[2], step[3], step[4], 1.0 + step[5]).try_inverse()?;
             shape *= turned;
             let moved = shape * Vector2::new(step[0], step[1]);
@@ -218,65 +246,87 @@ impl Template {
             if deformed.is_nan() || deformed > self.params.max_distortion || shift.amax() > REACH {
                 return None;
             }
+            // So near, the fit would tell nothing new.
             if moved.amax() < CONVERGED {
                 break;
             }
+            found = fit(&shape, &shift)?;
         }
-        let fitted = self.fit(pyramid, level, frame, &shape, &shift, &mut values)?;
-        let correlation = self.correlation(&values);
-        if correlation.is_nan() || correlation < self.params.min_correlation {
+        if found.correlation.is_nan() || found.correlation < self.params.min_correlation {
             return None;
         }
-        let mut remaining = 0.0;
-        for ((row, &value), &weight) in self.jacobian.iter().zip(&values).zip(&self.weights) {
-            let explained: f64 = row.iter().zip(&fitted).map(|(j, theta)| f64::from(*j) * theta).sum();
-            remaining += f64::from(weight) * (f64::from(value) - explained).powi(2);
-        }
-        let variance = CORRELATED_SAMPLES * remaining / (fitted[6] * fitted[6]).max(MIN_GAIN * MIN_GAIN);
-        let noise_px = (0.5 * variance * self.shift_covariance.trace()).sqrt() * frame.spacing();
+        let gain = found.theta[6].abs().max(MIN_GAIN);
+        let variance = CORRELATED_SAMPLES * found.remaining / (gain * gain);
+        let noise_px = (0.5 * variance * self.shift_variance).sqrt() * frame.spacing();
         let pixel = frame.pixel(&shift);
         (noise_px.is_finite() && pixel.iter().all(|value| value.is_finite())).then_some(Aligned {
             pixel,
             noise_px,
-            correlation,
+            correlation: found.correlation,
             shape,
         })
     }
 
-    /// θ for the patch under the present map, and its values.
-    fn fit(
-        &self,
-        pyramid: &ImagePyramid,
-        level: usize,
-        frame: &PatchFrame,
-        shape: &Matrix2<f64>,
-        shift: &Vector2<f64>,
-        values: &mut Vec<f32>,
-    ) -> Option<SVector<f64, UNKNOWNS>> {
-        let pixels = self.offsets.iter().map(|q| frame.pixel(&(shape * q + shift)).cast());
-        if !pyramid.sample(level, pixels, values) {
-            return None;
-        }
-        let mut theta = [0.0_f32; UNKNOWNS];
-        for (row, &value) in self.solve.iter().zip(values.iter()) {
-            for (sum, &factor) in theta.iter_mut().zip(row) {
-                *sum += factor * value;
+    /// θ for the samples of an image, row by row.
+    fn fit(&self, window: &[f32], values: &[f32]) -> Fit {
+        let (side, across) = (self.radius * 2 + 3, window.len());
+        // Sums over the rows, column by column: of T_x, y·T_x, T_y, y·T_y, T and 1 times I, and of I².
+        let mut sums = [const { [0.0_f32; MAX_ACROSS] }; 7];
+        let [dx, dxy, dy, dyy, own, one, squared] = &mut sums;
+        for (y, (&weight, values)) in window.iter().zip(values.chunks_exact(across)).enumerate() {
+            let qy = y as f32 - self.radius as f32;
+            let row = |step: usize| &self.samples[(y + step) * side..(y + step + 1) * side];
+            let (above, row, below) = (&row(0)[1..=across], row(1), &row(2)[1..=across]);
+            let (left, here, right) = (&row[..across], &row[1..=across], &row[2..]);
+            for x in 0..across {
+                let value = values[x] - self.mean;
+                let weighted = weight * value;
+                let (by_x, by_y) = ((right[x] - left[x]) * weighted, (below[x] - above[x]) * weighted);
+                dx[x] += by_x;
+                dxy[x] += qy * by_x;
+                dy[x] += by_y;
+                dyy[x] += qy * by_y;
+                own[x] += here[x] * weighted;
+                one[x] += weighted;
+                squared[x] += value * weighted;
             }
         }
-        Some(SVector::from_fn(|i, _| f64::from(theta[i])))
-    }
-
-    fn correlation(&self, values: &[f32]) -> f64 {
-        let weighted = |of: &dyn Fn(usize) -> f64| {
-            self.weights.iter().enumerate().map(|(at, &weight)| f64::from(weight) * of(at)).sum::<f64>()
+        let total = |sums: &[f32], factor: &dyn Fn(f64) -> f64| -> f64 {
+            let weighted = window.iter().zip(sums).enumerate();
+            let term = |(x, (weight, sum)): (usize, (&f32, &f32))| {
+                f64::from(*weight) * f64::from(*sum) * factor(x as f64 - self.radius as f64)
+            };
+            weighted.map(term).sum()
         };
-        let here = weighted(&|at| self.values[at].into());
-        let there = weighted(&|at| values[at].into());
-        let deviations = |at: usize| (f64::from(self.values[at]) - here, f64::from(values[at]) - there);
-        let covariance = weighted(&|at| deviations(at).0 * deviations(at).1);
-        let variances = weighted(&|at| deviations(at).0.powi(2)) * weighted(&|at| deviations(at).1.powi(2));
-        covariance / variances.sqrt()
+        // Half, since the gradient is half of the difference.
+        let (half, half_x, whole) = (|_: f64| 0.5, |qx: f64| 0.5 * qx, |_: f64| 1.0);
+        let right = SVector::from([
+            total(dx, &half),
+            total(dy, &half),
+            total(dx, &half_x),
+            total(dxy, &half),
+            total(dy, &half_x),
+            total(dyy, &half),
+            total(own, &whole),
+            total(one, &whole),
+        ]);
+        let (theta, squared) = (self.inverse * right, total(squared, &whole));
+        let variance = squared - right[7] * right[7];
+        Fit {
+            theta,
+            remaining: (squared - theta.dot(&right)).max(0.0),
+            correlation: right[6] / (self.variance * variance).sqrt(),
+        }
     }
+}
+
+/// One factor of Ω, which is the same along both axes, of sum one.
+fn window(radius: usize) -> Vec<f32> {
+    let falloff = -0.5 / (WINDOW * radius as f64).powi(2);
+    let weights = |x: isize| (falloff * (x * x) as f64).exp();
+    let radius = radius as isize;
+    let sum: f64 = (-radius..=radius).map(weights).sum();
+    (-radius..=radius).map(|x| (weights(x) / sum) as f32).collect()
 }
 
 #[cfg(test)]
@@ -310,7 +360,7 @@ mod tests {
 
     fn template(pyramid: &ImagePyramid, frame: &PatchFrame) -> Option<Template> {
         let params = PatchParams::default();
-        Template::new(&params, &Patch::cut(&params, pyramid, frame)?)
+        Template::new(&params, Patch::cut(&params, pyramid, frame)?)
     }
 
     #[test]
@@ -323,7 +373,7 @@ mod tests {
             0.8 * texture(q.x, q.y) + 15.0
         });
         let found =
-            template(&first, &frame(64.0, 64.0, 1.0)).unwrap().align(&second, &frame(62.0, 65.0, 1.0));
+            template(&first, &frame(64.0, 64.0, 1.0)).unwrap().align(&second, &frame(62.0, 65.0, 1.0), -1.0);
         let found = found.unwrap();
         assert!((found.pixel - Vector2::new(60.7, 66.2)).norm() < 0.05, "{found:?}");
         assert!(found.correlation > 0.99 && found.noise_px < 0.02, "{found:?}");
@@ -341,7 +391,7 @@ mod tests {
                 ((bits >> 40) as f64 / f64::from(1 << 24) - 0.5) * 40.0
             };
             let second = pyramid([128, 128], false, |x, y| texture(x, y) + noise(x, y));
-            let found = template.align(&second, &frame(64.3, 63.8, 1.0)).unwrap();
+            let found = template.align(&second, &frame(64.3, 63.8, 1.0), -1.0).unwrap();
             squared += (found.pixel - Vector2::new(64.0, 64.0)).norm_squared() / 2.0;
             stated += found.noise_px * found.noise_px;
         }
@@ -360,8 +410,11 @@ mod tests {
         };
         let first = pyramid([256, 128], true, wavy);
         let second = pyramid([256, 128], true, |x, y| wavy(x - 5.4, y));
-        let found =
-            template(&first, &frame(253.0, 64.0, 1.0)).unwrap().align(&second, &frame(258.0, 64.0, 1.0));
+        let found = template(&first, &frame(253.0, 64.0, 1.0)).unwrap().align(
+            &second,
+            &frame(258.0, 64.0, 1.0),
+            -1.0,
+        );
         assert!((found.unwrap().pixel - Vector2::new(258.4, 64.0)).norm() < 0.03, "{found:?}");
     }
 
@@ -376,7 +429,7 @@ mod tests {
         assert!(template(&first, &frame(5.0, 64.0, 1.0)).is_none());
         let template = template(&first, &middle).unwrap();
         for (pyramid, at) in [(&flat, middle), (&other, middle), (&first, frame(3.0, 64.0, 1.0))] {
-            assert!(template.align(pyramid, &at).is_none());
+            assert!(template.align(pyramid, &at, -1.0).is_none());
         }
     }
 }

@@ -1,5 +1,3 @@
-use nalgebra::Vector2;
-
 use crate::DecodedImage;
 use crate::extract::luma;
 
@@ -51,47 +49,119 @@ impl ImagePyramid {
         level.min(self.levels.len() - 1)
     }
 
-    /// Samples one level bilinearly at image pixels; false when one lies outside.
-    pub(super) fn sample(
-        &self,
-        level: usize,
-        pixels: impl Iterator<Item = Vector2<f32>>,
-        values: &mut Vec<f32>,
-    ) -> bool {
-        let scale = (1.0 / f64::from(1_u32 << level)) as f32;
+    /// Samples one level bilinearly at the pixels of a grid, for whole numbers up to `radius`, row by row; false when one
+    /// lies outside.
+    pub(super) fn sample(&self, level: usize, grid: &Grid, radius: usize, samples: &mut Samples) -> bool {
+        let scale = 1.0 / f64::from(1_u32 << level);
         let level = &self.levels[level];
-        let (width, height) = (level.width as f32, level.height as f32);
+        let Samples { places: [columns, rows], values } = samples;
+        // Places are taken from a pixel so near that single precision tells a hundred-thousandth of a pixel apart, and
+        // so far to the upper left that all are positive.
+        if !grid.0.iter().all(Quadratic::is_sane) {
+            return false;
+        }
+        let origin = grid.0.each_ref().map(|axis| (axis.constant * scale - 0.5).floor() - REACH);
+        let (left, right) = grid.0[0].places(scale, origin[0], radius, columns);
+        let (top, bottom) = grid.0[1].places(scale, origin[1], radius, rows);
+        let positive = left >= 0.0 && top >= 0.0 && right < 2.0 * REACH as f32 && bottom < 2.0 * REACH as f32;
+        let origin = origin.map(|origin| origin as isize);
+        let lowest = [left, top].map(|place| place as isize);
+        let highest = [right, bottom].map(|place| place as isize);
+        let (width, height) = (level.width as isize, level.height as isize);
+        if !positive || origin[1] + lowest[1] < 0 || origin[1] + highest[1] + 1 >= height {
+            return false;
+        }
+        let inside = origin[0] + lowest[0] >= 0 && origin[0] + highest[0] + 1 < width;
+        if !inside && !self.wraps_around {
+            return false;
+        }
+        let places = columns.iter().zip(rows.iter());
         values.clear();
-        for pixel in pixels {
-            let (mut x, y) = (pixel.x * scale - 0.5, pixel.y * scale - 0.5);
-            if self.wraps_around {
-                x -= (x / width).floor() * width;
-                // Rounding may lead to the end itself.
-                x = if x < width { x } else { 0.0 };
-            }
-            let right = if self.wraps_around { width } else { width - 1.0 };
-            if !(x >= 0.0 && x < right && y >= 0.0 && y < height - 1.0) {
-                return false;
-            }
-            values.push(level.bilinear(x, y));
+        if inside {
+            values.extend(places.map(|(&x, &y)| {
+                let (column, row) = (x as i32, y as i32);
+                let first = (origin[1] + row as isize) * width + origin[0] + column as isize;
+                level.bilinear([first as usize, first as usize + 1], x - column as f32, y - row as f32)
+            }));
+        } else {
+            values.extend(places.map(|(&x, &y)| {
+                let (column, row) = (x as i32, y as i32);
+                let start = (origin[1] + row as isize) * width;
+                let at = |column: isize| (start + column.rem_euclid(width)) as usize;
+                let column_of_level = origin[0] + column as isize;
+                level.bilinear(
+                    [at(column_of_level), at(column_of_level + 1)],
+                    x - column as f32,
+                    y - row as f32,
+                )
+            }));
         }
         true
     }
 }
 
+/// Farthest that a sample may be from the middle of its patch, in pixels of the level.
+const REACH: f64 = 512.0;
+
+/// Two functions of the steps (x, y) of a patch: the column and the row of the pixel there.
+#[derive(Debug, Clone)]
+pub(super) struct Grid(pub [Quadratic; 2]);
+
+/// constant + linear·(x, y) + square·(x², y²) + mixed·x·y.
+#[derive(Debug, Clone)]
+pub(super) struct Quadratic {
+    pub constant: f64,
+    pub linear: [f64; 2],
+    pub square: [f64; 2],
+    pub mixed: f64,
+}
+
+impl Quadratic {
+    /// Whether all is finite and of the size of images, so that no place overflows.
+    fn is_sane(&self) -> bool {
+        let Self { constant, linear, square, mixed } = self;
+        linear.iter().chain(square).chain([constant, mixed]).all(|value| value.abs() < 1e9)
+    }
+
+    /// The places on a level, from the pixel `origin` of it on; returns the lowest and the highest.
+    fn places(&self, scale: f64, origin: f64, radius: usize, places: &mut Vec<f32>) -> (f32, f32) {
+        let reach = radius as i32;
+        let (mut lowest, mut highest) = (f32::INFINITY, f32::NEG_INFINITY);
+        places.clear();
+        let square = (scale * self.square[0]) as f32;
+        for y in -reach..=reach {
+            let y = f64::from(y);
+            let constant = self.constant + y * (self.linear[1] + y * self.square[1]);
+            let constant = (scale * constant - 0.5 - origin) as f32;
+            let linear = (scale * (self.linear[0] + y * self.mixed)) as f32;
+            places.extend((-reach..=reach).map(|x| {
+                let x = x as f32;
+                constant + x * (linear + x * square)
+            }));
+        }
+        for &place in &*places {
+            lowest = if place < lowest { place } else { lowest };
+            highest = if place > highest { place } else { highest };
+        }
+        (lowest, highest)
+    }
+}
+
+/// The samples of a patch, and memory to find them.
+#[derive(Debug, Default)]
+pub(super) struct Samples {
+    places: [Vec<f32>; 2],
+    pub values: Vec<f32>,
+}
+
 impl Level {
-    /// The value at a place in columns and rows from the centre of the first pixel.
+    /// The value between the pixels `upper` and those below them, by its shares of the right and lower ones.
     #[inline]
-    fn bilinear(&self, x: f32, y: f32) -> f32 {
-        let (column, row) = (x as usize, y as usize);
-        let (a, b) = (x - column as f32, y - row as f32);
-        let next = if column + 1 == self.width { 0 } else { column + 1 };
-        let (upper, lower) =
-            (&self.values[row * self.width..], &self.values[(row + 1) * self.width..(row + 2) * self.width]);
-        let value = |values: &[u8], at: usize| f32::from(values[at]);
-        let above = value(upper, column) + a * (value(upper, next) - value(upper, column));
-        let below = value(lower, column) + a * (value(lower, next) - value(lower, column));
-        above + b * (below - above)
+    fn bilinear(&self, upper: [usize; 2], right: f32, lower: f32) -> f32 {
+        let value = |at: usize| f32::from(self.values[at]);
+        let row = |[a, b]: [usize; 2]| value(a) + right * (value(b) - value(a));
+        let (above, below) = (row(upper), row(upper.map(|at| at + self.width)));
+        above + lower * (below - above)
     }
 
     /// Half the size, each pixel from 4 × 4 by the weights (1, 3, 3, 1)/8: its centre is that of the 2 × 2 it stands for.
@@ -136,8 +206,14 @@ mod tests {
     }
 
     fn value(pyramid: &ImagePyramid, level: usize, x: f32, y: f32) -> Option<f32> {
-        let mut values = Vec::new();
-        pyramid.sample(level, [Vector2::new(x, y)].into_iter(), &mut values).then(|| values[0])
+        let mut samples = Samples::default();
+        let still = |constant: f32| Quadratic {
+            constant: constant.into(),
+            linear: [0.0; 2],
+            square: [0.0; 2],
+            mixed: 0.0,
+        };
+        pyramid.sample(level, &Grid([still(x), still(y)]), 0, &mut samples).then(|| samples.values[0])
     }
 
     #[test]

@@ -1,6 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use rayon::prelude::*;
 use serde_json::Value;
 use setloc_features::ImageFeatures;
 use setloc_sfm::Reconstruction;
@@ -45,8 +46,10 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
             (run, skipped)
         }
         BuildOutcome::Built(built) => {
-            write_atomically(output, &codec::encode(&*built.scene)?)?;
-            write_exports(&export, built, &session)?;
+            let write_scene = || write_atomically(output, &codec::encode(&*built.scene)?);
+            let (scene, models) = rayon::join(write_scene, || write_models(&export, built));
+            scene.and(models)?;
+            write_report(&export, built, &session)?;
             summarize(&built.scene, folder.images.len() + folder.skipped.len());
             (&built.run, &built.skipped)
         }
@@ -127,8 +130,8 @@ pub fn scene_markers(model: &Reconstruction) -> Vec<Marker> {
     model.registered().filter_map(marker).collect()
 }
 
-/// Poses, point cloud, COLMAP model, picture and report.
-pub fn write_exports(folder: &Path, built: &Built, session: &Session) -> Result<()> {
+/// Poses, point cloud, COLMAP model and picture.
+fn write_models(folder: &Path, built: &Built) -> Result<()> {
     let model = &built.scene.main().map_or_else(Reconstruction::default, Reconstruction::by_name);
     let markers = scene_markers(model);
     let centres: Vec<_> =
@@ -138,10 +141,17 @@ pub fn write_exports(folder: &Path, built: &Built, session: &Session) -> Result<
         .iter()
         .map(|image| built.features.get(&image.name).map(|features| &**features))
         .collect();
-    write_json(&folder.join("poses.json"), &scene_json(&built.scene))?;
-    write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes())?;
-    write_colmap(&folder.join("colmap"), model, &features)?;
-    write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?)?;
+    let writers: [&(dyn Fn() -> Result<()> + Sync); 4] = [
+        &|| write_colmap(&folder.join("colmap"), model, &features),
+        &|| write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes()),
+        &|| write_json(&folder.join("poses.json"), &scene_json(&built.scene)),
+        &|| write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?),
+    ];
+    writers.into_par_iter().try_for_each(|write| write())
+}
+
+/// What the build cost and what is wrong with the scene; written last.
+fn write_report(folder: &Path, built: &Built, session: &Session) -> Result<()> {
     let mut report = session.report.to_json();
     report["scene"] = serde_json::json!(built.hash);
     report["skipped"] = serde_json::json!(built.skipped);

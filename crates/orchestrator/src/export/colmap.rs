@@ -1,10 +1,10 @@
-use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::Path;
 
 use anyhow::Result;
+use rayon::prelude::*;
 use setloc_features::ImageFeatures;
-use setloc_sfm::Reconstruction;
+use setloc_sfm::{Reconstruction, ReconstructionImage, ReconstructionPoint};
 
 use crate::store::write_atomically;
 
@@ -27,35 +27,52 @@ pub fn write_colmap(
         let params: Vec<String> = camera.params.iter().map(f64::to_string).collect();
         writeln!(cameras, "{} {name} {} {} {}", at + 1, camera.width, camera.height, params.join(" "))?;
     }
-    let mut points_of_image: Vec<BTreeMap<u32, usize>> = vec![BTreeMap::new(); model.images.len()];
-    let mut points =
-        String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
+    let mut points_of_image: Vec<Vec<(u32, usize)>> = vec![Vec::new(); model.images.len()];
     for (at, point) in model.points.iter().enumerate() {
-        let (p, [r, g, b]) = (point.position, point.color);
-        write!(points, "{} {} {} {} {r} {g} {b} {:.4}", at + 1, p.x, p.y, p.z, point.error_sigma)?;
         for observation in &point.track {
-            points_of_image[observation.image.index()].insert(observation.feature, at + 1);
-            write!(points, " {} {}", observation.image.0 + 1, observation.feature)?;
+            points_of_image[observation.image.index()].push((observation.feature, at + 1));
         }
-        points.push('\n');
     }
-    let mut images = String::from(
-        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n",
-    );
-    for (at, image) in model.images.iter().enumerate() {
-        let Some(pose) = image.world_from_camera else { continue };
+    points_of_image.par_iter_mut().for_each(|points| points.sort_unstable());
+    let point = |(at, point): (usize, &ReconstructionPoint)| -> Result<String, std::fmt::Error> {
+        let (p, [r, g, b]) = (point.position, point.color);
+        let mut line = String::new();
+        write!(line, "{} {} {} {} {r} {g} {b} {:.4}", at + 1, p.x, p.y, p.z, point.error_sigma)?;
+        for observation in &point.track {
+            write!(line, " {} {}", observation.image.0 + 1, observation.feature)?;
+        }
+        line.push('\n');
+        Ok(line)
+    };
+    let image = |(at, image): (usize, &ReconstructionImage)| -> Result<String, std::fmt::Error> {
+        let mut lines = String::new();
+        let Some(pose) = image.world_from_camera else { return Ok(lines) };
         let camera_from_world = pose.inverse();
         let (q, t) = (camera_from_world.rotation.quaternion(), camera_from_world.translation);
         let ids = format!("{} {}", image.camera.0 + 1, image.name);
-        writeln!(images, "{} {} {} {} {} {} {} {} {ids}", at + 1, q.w, q.i, q.j, q.k, t.x, t.y, t.z)?;
+        writeln!(lines, "{} {} {} {} {} {} {} {} {ids}", at + 1, q.w, q.i, q.j, q.k, t.x, t.y, t.z)?;
         let keypoints = features.get(at).copied().flatten().map_or(&[][..], |features| &features.keypoints);
         for (index, keypoint) in keypoints.iter().enumerate() {
-            let point = points_of_image[at].get(&(index as u32)).map_or("-1".to_owned(), usize::to_string);
-            write!(images, "{}{} {} {point}", if index > 0 { " " } else { "" }, keypoint.x, keypoint.y)?;
+            write!(lines, "{}{} {} ", if index > 0 { " " } else { "" }, keypoint.x, keypoint.y)?;
+            let points = &points_of_image[at];
+            match points.binary_search_by_key(&(index as u32), |(feature, _)| *feature) {
+                Ok(found) => write!(lines, "{}", points[found].1)?,
+                Err(_) => lines.push_str("-1"),
+            }
         }
-        images.push('\n');
-    }
-    write_atomically(&folder.join("cameras.txt"), cameras.as_bytes())?;
-    write_atomically(&folder.join("images.txt"), images.as_bytes())?;
-    write_atomically(&folder.join("points3D.txt"), points.as_bytes())
+        lines.push('\n');
+        Ok(lines)
+    };
+    let (points, images) = rayon::join(
+        || model.points.par_iter().enumerate().map(point).collect::<Result<String, _>>(),
+        || model.images.par_iter().enumerate().map(image).collect::<Result<String, _>>(),
+    );
+    let points =
+        format!("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n{}", points?);
+    let images = format!(
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n{}",
+        images?
+    );
+    let files = [("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", points)];
+    files.par_iter().try_for_each(|(name, text)| write_atomically(&folder.join(name), text.as_bytes()))
 }

@@ -3,6 +3,7 @@
 use std::any::Any;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
@@ -89,6 +90,20 @@ struct Shared {
     fatal: Option<anyhow::Error>,
 }
 
+/// Results that may wait to be kept; further ones hold up the jobs that made them.
+const MOST_WAITING: usize = 16;
+
+/// The result of a job on its way to the store.
+struct Unkept {
+    id: JobId,
+    fingerprint: Fingerprint,
+    output: ContentHash,
+    file: Vec<u8>,
+    started_secs: f64,
+    wall_secs: f64,
+    cpu_secs: f64,
+}
+
 /// A graph being run.
 pub struct Executor<'a> {
     pub(super) graph: &'a JobGraph<'a>,
@@ -138,7 +153,16 @@ impl<'a> Executor<'a> {
             *jobs.entry(self.graph.job(id).kind.to_owned()).or_insert(0) += 1;
         }
         self.options.observer.notice(&Event::Planned { jobs });
-        rayon::scope(|scope| self.pump(scope));
+        // Syncing a file to the disk takes as long as many a job does, and no core: it is done beside the jobs.
+        let (keep, unkept) = sync_channel(MOST_WAITING);
+        let unkept = Mutex::new(unkept);
+        std::thread::scope(|threads| {
+            for _ in 0..self.options.threads.max(1) {
+                threads.spawn(|| self.keep_results(&unkept));
+            }
+            rayon::scope(|scope| self.pump(scope, &keep));
+            drop(keep);
+        });
         self.options.observer.notice(&Event::Ended);
         if let Some(error) = self.lock().fatal.take() {
             return Err(error);
@@ -170,7 +194,7 @@ impl<'a> Executor<'a> {
     }
 
     /// Starts as many ready jobs as threads and memory allow, in the order they were added.
-    fn pump<'s>(&'s self, scope: &rayon::Scope<'s>) {
+    fn pump<'s>(&'s self, scope: &rayon::Scope<'s>, keep: &'s SyncSender<Unkept>) {
         loop {
             let mut shared = self.lock();
             let stopped = self.options.stop.load(Ordering::Relaxed) || shared.fatal.is_some();
@@ -187,27 +211,30 @@ impl<'a> Executor<'a> {
             shared.memory_in_flight += self.graph.job(id).memory;
             drop(shared);
             scope.spawn(move |scope| {
-                self.settle(id);
-                self.pump(scope);
+                self.settle(id, keep);
+                self.pump(scope, keep);
             });
         }
     }
 
     /// Decides one job and frees those that waited for it.
-    fn settle(&self, id: JobId) {
+    fn settle(&self, id: JobId, keep: &SyncSender<Unkept>) {
         let job = self.graph.job(id);
         let lacking = self.graph.uses(id).any(|(used, edge)| edge.required && self.output(used).is_none());
         let (state, key, output) = if lacking {
             self.options.observer.notice(&Event::Skipped { kind: job.kind, job: job.name.clone() });
             (State::Skipped, None, None)
         } else {
-            self.decide(id)
+            self.decide(id, keep)
         };
         let mut shared = self.lock();
         shared.in_flight -= 1;
         shared.memory_in_flight -= job.memory;
         let slot = &mut shared.slots[id.index()];
-        (slot.state, slot.key, slot.output) = (state, key, output);
+        // Unless keeping the result has failed by now.
+        if slot.state == State::Waiting {
+            (slot.state, slot.key, slot.output) = (state, key, output);
+        }
         for used in self.graph.uses(id).map(|(used, _)| used) {
             let slot = &mut shared.slots[used.index()];
             slot.users_left -= 1;
@@ -225,7 +252,11 @@ impl<'a> Executor<'a> {
     }
 
     /// Takes the result from the store or runs the job.
-    fn decide(&self, id: JobId) -> (State, Option<ContentHash>, Option<ContentHash>) {
+    fn decide(
+        &self,
+        id: JobId,
+        keep: &SyncSender<Unkept>,
+    ) -> (State, Option<ContentHash>, Option<ContentHash>) {
         let job = self.graph.job(id);
         let fingerprint = self.fingerprint(id);
         let key = fingerprint.key();
@@ -233,16 +264,48 @@ impl<'a> Executor<'a> {
             self.options.observer.notice(&Event::Hit { kind: job.kind, job: job.name.clone() });
             return (State::Hit, Some(key), Some(record.output));
         }
-        match self.execute(id, &fingerprint) {
-            Ok(output) => (State::Ran, Some(key), Some(output)),
-            Err(error) => {
-                let reason = format!("{error:#}");
-                self.options.observer.notice(&Event::Failed {
+        match self.execute(id, fingerprint) {
+            Ok(made) => {
+                let output = made.output;
+                // The receiver lives as long as any job runs.
+                let _ = keep.send(made);
+                (State::Ran, Some(key), Some(output))
+            }
+            Err(error) => (self.failed(id, &error), Some(key), None),
+        }
+    }
+
+    /// Says that a job failed.
+    fn failed(&self, id: JobId, error: &anyhow::Error) -> State {
+        let (job, reason) = (self.graph.job(id), format!("{error:#}"));
+        let event = Event::Failed { kind: job.kind, job: job.name.clone(), reason: reason.clone() };
+        self.options.observer.notice(&event);
+        State::Failed(reason)
+    }
+
+    /// Stores results until no job is left that could send one.
+    fn keep_results(&self, unkept: &Mutex<Receiver<Unkept>>) {
+        let next = || unkept.lock().unwrap_or_else(PoisonError::into_inner).recv();
+        while let Ok(Unkept { id, fingerprint, output, file, started_secs, wall_secs, cpu_secs }) = next() {
+            let (job, bytes) = (self.graph.job(id), file.len() as u64);
+            match self.options.store.keep(&fingerprint, output, &file, cpu_secs) {
+                Ok(()) => self.options.observer.notice(&Event::Finished {
                     kind: job.kind,
                     job: job.name.clone(),
-                    reason: reason.clone(),
-                });
-                (State::Failed(reason), Some(key), None)
+                    started_secs,
+                    wall_secs,
+                    cpu_secs,
+                    bytes,
+                }),
+                Err(error) => {
+                    let reported = anyhow::anyhow!("{error:#}");
+                    let reason = format!("cannot keep the result of {}", job.label());
+                    let state = self.failed(id, &reported.context(reason));
+                    let mut shared = self.lock();
+                    shared.fatal.get_or_insert(error);
+                    let slot = &mut shared.slots[id.index()];
+                    (slot.state, slot.output) = (state, None);
+                }
             }
         }
     }
@@ -259,49 +322,30 @@ impl<'a> Executor<'a> {
         Fingerprint { kind: job.kind.to_owned(), version: job.version, params: job.params.clone(), inputs }
     }
 
-    /// Runs the job's work and stores its result.
-    fn execute(&self, id: JobId, fingerprint: &Fingerprint) -> Result<ContentHash> {
+    /// Runs the job's work.
+    fn execute(&self, id: JobId, fingerprint: Fingerprint) -> Result<Unkept> {
         let job = self.graph.job(id);
         self.options.observer.notice(&Event::Started { kind: job.kind, job: job.name.clone() });
         let alone = self.running.fetch_add(1, Ordering::SeqCst) == 0;
         let ticket = self.started.fetch_add(1, Ordering::SeqCst);
         let (thread, process, wall) = (clock::thread_cpu_secs(), clock::process_cpu_secs(), Instant::now());
         let started_secs = self.begun.elapsed().as_secs_f64();
-        let inputs = Inputs { executor: self, id };
+        let inputs = Inputs::new(self, id);
         let product = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| (job.work)(&inputs)))
             .unwrap_or_else(|_| Err(anyhow::anyhow!("the job panicked: this is a bug")));
         // A job that ran alone may have used all cores: the process's time is its own.
         let alone = alone && self.started.load(Ordering::SeqCst) == ticket + 1;
         let cpu_secs =
             if alone { clock::process_cpu_secs() - process } else { clock::thread_cpu_secs() - thread };
-        self.running.fetch_sub(1, Ordering::SeqCst);
-        let product = product?;
-        let output = match self.options.store.write(fingerprint, &product.file, cpu_secs) {
-            Ok(output) => output,
-            Err(error) => {
-                let reason = format!("cannot keep the result of {}", job.label());
-                let reported = anyhow::anyhow!("{error:#}");
-                self.lock().fatal.get_or_insert(error);
-                return Err(reported.context(reason));
-            }
-        };
         let wall_secs = wall.elapsed().as_secs_f64();
-        let bytes = product.file.len() as u64;
+        self.running.fetch_sub(1, Ordering::SeqCst);
+        let Product { value, file } = product?;
+        let output = ContentHash::of(&file);
         let slot = &mut self.lock().slots[id.index()];
         if slot.users_left > 0 {
-            slot.value = Some(product.value);
+            slot.value = Some(value);
         }
-        let job = job.name.clone();
-        let kind = self.graph.job(id).kind;
-        self.options.observer.notice(&Event::Finished {
-            kind,
-            job,
-            started_secs,
-            wall_secs,
-            cpu_secs,
-            bytes,
-        });
-        Ok(output)
+        Ok(Unkept { id, fingerprint, output, file, started_secs, wall_secs, cpu_secs })
     }
 
     /// Hash of a job's result, `None` when it has none.
@@ -355,7 +399,7 @@ impl<'a> Executor<'a> {
         let text = format!("the stored result of {label} cannot be used and is made again: {error:#}");
         self.options.observer.notice(&Event::Warning { text });
         self.options.store.discard(output);
-        let product: Product = (self.graph.job(id).work)(&Inputs { executor: self, id })?;
+        let product: Product = (self.graph.job(id).work)(&Inputs::new(self, id))?;
         if let Err(error) = self.options.store.write(&self.fingerprint(id), &product.file, 0.0) {
             let text = format!("{label} was made again but cannot be kept: {error:#}");
             self.options.observer.notice(&Event::Warning { text });

@@ -132,11 +132,18 @@ impl<'a> JobGraph<'a> {
 
 /// The results a job may use.
 pub struct Inputs<'e, 'a> {
-    pub(super) executor: &'e Executor<'a>,
-    pub(super) id: JobId,
+    executor: &'e Executor<'a>,
+    id: JobId,
+    /// The jobs whose results are used, by role: a model uses thousands.
+    used: BTreeMap<&'e str, JobId>,
 }
 
-impl Inputs<'_, '_> {
+impl<'e, 'a> Inputs<'e, 'a> {
+    pub(super) fn new(executor: &'e Executor<'a>, id: JobId) -> Self {
+        let used = executor.graph.uses(id).map(|(used, edge)| (edge.role.as_str(), used)).collect();
+        Self { executor, id, used }
+    }
+
     /// The result in a role.
     ///
     /// # Errors
@@ -157,7 +164,7 @@ impl Inputs<'_, '_> {
     }
 
     fn used(&self, role: &str) -> Option<JobId> {
-        self.executor.graph.uses(self.id).find(|(_, edge)| edge.role == role).map(|(used, _)| used)
+        self.used.get(role).copied()
     }
 
     /// The result in a role, or `None` when the job that makes it failed.

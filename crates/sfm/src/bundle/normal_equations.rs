@@ -16,6 +16,7 @@ use setloc_features::MAX_CAMERA_PARAMS;
 
 use super::RobustLoss;
 use super::camera_system::CameraSystem;
+use super::loss::LossSum;
 use super::pattern::{BlockPattern, NONE};
 
 /// The damping is λ times the diagonal of H within these bounds.
@@ -304,7 +305,7 @@ impl<const D: usize> NormalEquations<D> {
             chunk.coupling.fill(0.0);
             chunk.base.fill(0.0);
             chunk.gradient.fill(0.0);
-            chunk.cost = 0.0;
+            let mut losses = LossSum::new(loss);
             let mut lin = Linearized {
                 residual: [0.0; 2],
                 point: [[0.0; 3]; 2],
@@ -317,8 +318,7 @@ impl<const D: usize> NormalEquations<D> {
                     let (link, target) = (&links[observation], &targets[observation]);
                     model.linearize(observation, link, &points[point], &mut lin);
                     let [r0, r1] = lin.residual;
-                    let (rho, weight) = loss.evaluate(r0 * r0 + r1 * r1);
-                    chunk.cost += 0.5 * rho;
+                    let weight = losses.add(r0 * r0 + r1 * r1);
                     let (r0, r1) = (weight * r0, weight * r1);
                     let [p0, p1] = &lin.point;
                     let weighted = [p0.map(|value| weight * value), p1.map(|value| weight * value)];
@@ -394,6 +394,7 @@ impl<const D: usize> NormalEquations<D> {
                 chunk.point_hessian[point - chunk.points.start] = v;
                 chunk.point_gradient[point - chunk.points.start] = g;
             }
+            chunk.cost = 0.5 * losses.total();
         });
         let mut cost = 0.0;
         self.base.fill(0.0);
@@ -488,12 +489,13 @@ impl<const D: usize> NormalEquations<D> {
     pub fn candidate_cost<M: Model<D>>(&mut self, model: &M) -> f64 {
         let (starts, loss) = (&self.observation_starts, model.loss());
         for_each_chunk(&mut self.chunks, |chunk| {
-            chunk.cost = 0.0;
+            let mut losses = LossSum::new(loss);
             for (point, position) in chunk.points.clone().zip(&chunk.candidate) {
                 for observation in starts[point]..starts[point + 1] {
-                    chunk.cost += 0.5 * loss.evaluate(model.squared_residual(observation, position)).0;
+                    losses.add(model.squared_residual(observation, position));
                 }
             }
+            chunk.cost = 0.5 * losses.total();
         });
         self.chunks.iter().map(|chunk| chunk.cost).sum::<f64>() + model.block_terms_cost()
     }

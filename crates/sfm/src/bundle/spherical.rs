@@ -1,6 +1,7 @@
 //! A [`BundleProblem`] as a [`Model`]: angular residuals, poses of 6 scalars, intrinsics as extra blocks.
 
 use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector2, Vector3};
+use rayon::prelude::*;
 use setloc_features::{Camera, CameraModel, MAX_CAMERA_PARAMS};
 
 use super::normal_equations::{BlockTerm, Linearized, Link, Model};
@@ -11,6 +12,9 @@ use crate::Rigid;
 
 /// Scalars of a pose: rotation (right perturbation, camera frame), then translation (world frame).
 pub(super) const POSE_DIM: usize = 6;
+
+/// Observations that are worth handing to another thread.
+const OBSERVATIONS_PER_TASK: usize = 2048;
 
 /// A pose as the inner loops want it.
 #[derive(Debug, Clone, Copy)]
@@ -121,7 +125,8 @@ impl Spherical {
         };
         let usable: Vec<(u32, Ray)> = problem
             .observations
-            .iter()
+            .par_iter()
+            .with_min_len(OBSERVATIONS_PER_TASK)
             .enumerate()
             .filter_map(|(index, observation)| Some((index as u32, usable_ray(observation)?)))
             .collect();

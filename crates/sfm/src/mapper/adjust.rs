@@ -1,5 +1,3 @@
-use std::collections::BTreeMap;
-
 use super::model::Model;
 use crate::{
     ImageId, PointId,
@@ -30,14 +28,16 @@ impl Scope {
     pub fn local(model: &Model<'_>, image: ImageId, neighbours: usize) -> Self {
         let mut shared = vec![0_usize; model.poses.len()];
         let mut points = Vec::new();
-        for (id, point) in model.live_points() {
-            if point.track.iter().any(|seen| seen.image == image) {
+        for (_, id) in model.observations_of(image) {
+            if let Some(point) = model.point(id) {
                 points.push(id);
                 for seen in &point.track {
                     shared[seen.image.index()] += 1;
                 }
             }
         }
+        points.sort_unstable();
+        points.dedup();
         let mut others: Vec<ImageId> =
             model.registered().filter(|&other| other != image && shared[other.index()] > 0).collect();
         others.sort_by_key(|other| (std::cmp::Reverse(shared[other.index()]), *other));
@@ -60,7 +60,7 @@ pub(super) fn is_adjustable(model: &Model<'_>, image: ImageId) -> bool {
 /// When every registered image is free the first one is held, which fixes six of the seven gauge freedoms; scale is
 /// left to the damping.
 pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope) -> BundleReport {
-    let mut pose_of_image: BTreeMap<ImageId, u32> = BTreeMap::new();
+    let mut pose_of_image: Vec<Option<u32>> = vec![None; model.poses.len()];
     let mut problem = BundleProblem {
         cameras: model.cameras.clone(),
         camera_freedom: vec![IntrinsicsFreedom::FIXED; model.cameras.len()],
@@ -96,7 +96,7 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
         for &seen in &point.track {
             let Some(pose) = &model.poses[seen.image.index()] else { continue };
             let next = problem.poses.len() as u32;
-            let pose_index = *pose_of_image.entry(seen.image).or_insert_with(|| {
+            let pose_index = *pose_of_image[seen.image.index()].get_or_insert_with(|| {
                 problem.poses.push(BundlePose {
                     camera: model.input.images[seen.image.index()].camera.0,
                     world_from_camera: pose.world_from_camera,
@@ -121,9 +121,9 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
             model.refresh_rays(camera);
         }
     }
-    for (&image, &pose) in &pose_of_image {
-        if free[image.index()] {
-            model.set_pose(image, Some(problem.poses[pose as usize].world_from_camera));
+    for (index, pose) in pose_of_image.into_iter().enumerate() {
+        if let Some(pose) = pose.filter(|_| free[index]) {
+            model.set_pose(ImageId(index as u32), Some(problem.poses[pose as usize].world_from_camera));
         }
     }
     for (id, adjusted) in kept.into_iter().zip(&problem.points) {

@@ -55,6 +55,12 @@ impl CorrespondenceGraph {
         Self { first_row, row_start, partners }
     }
 
+    /// Keypoints of other images that match any of `image`.
+    pub fn partners_of(&self, image: ImageId) -> &[Observation] {
+        let rows = self.first_row[image.index()]..=self.first_row[image.index() + 1];
+        &self.partners[self.row_start[*rows.start()] as usize..self.row_start[*rows.end()] as usize]
+    }
+
     /// Keypoints of other images that match keypoint `feature` of `image`.
     pub fn partners(&self, image: ImageId, feature: u32) -> &[Observation] {
         let row = self.first_row[image.index()] + feature as usize;

@@ -1,4 +1,5 @@
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use setloc_features::Match;
 
 use super::{MapperParams, correspondence::CorrespondenceGraph, direction, model::Model};
@@ -19,7 +20,7 @@ pub(super) fn ranked_pairs(
     let mut ranked: Vec<(f64, usize)> = model
         .input
         .pairs
-        .iter()
+        .par_iter()
         .enumerate()
         .filter(|&(index, pair)| {
             enabled[index]

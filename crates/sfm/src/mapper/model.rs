@@ -1,6 +1,5 @@
-use std::collections::BTreeSet;
-
 use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
 use setloc_features::{Camera, Rays};
 
 use super::MapperInput;
@@ -44,8 +43,8 @@ pub(super) struct Model<'a> {
     /// Deleted points leave `None`, so that ids stay valid.
     pub points: Vec<Option<ModelPoint>>,
     point_of_feature: Vec<Vec<u32>>,
-    /// Pairs that were matched, the lower image first; `None` where nothing is said of them.
-    matched: Option<BTreeSet<(ImageId, ImageId)>>,
+    /// The images that each was matched with, ascending; `None` where nothing is said of them.
+    matched: Option<Vec<Vec<ImageId>>>,
 }
 
 const NO_POINT: u32 = u32::MAX;
@@ -54,7 +53,7 @@ impl<'a> Model<'a> {
     pub fn new(input: &'a MapperInput<'a>) -> Self {
         let rays = input
             .images
-            .iter()
+            .par_iter()
             .map(|image| image.features.rays(&input.cameras[image.camera.index()]))
             .collect();
         Self {
@@ -65,15 +64,29 @@ impl<'a> Model<'a> {
             points: Vec::new(),
             point_of_feature: input.images.iter().map(|image| vec![NO_POINT; image.features.len()]).collect(),
             matched: (!input.putative.is_empty()).then(|| {
-                let pairs = input.putative.iter();
-                pairs.map(|p| (p.first.min(p.second), p.first.max(p.second))).collect()
+                let mut matched = vec![Vec::new(); input.images.len()];
+                for pair in input.putative {
+                    matched[pair.first.index()].push(pair.second);
+                    matched[pair.second.index()].push(pair.first);
+                }
+                for others in &mut matched {
+                    others.sort_unstable();
+                    others.dedup();
+                }
+                matched
             }),
         }
     }
 
-    /// Whether two images were matched at all: of a large scene only neighbours are.
-    pub fn was_matched(&self, a: ImageId, b: ImageId) -> bool {
-        self.matched.as_ref().is_none_or(|pairs| pairs.contains(&(a.min(b), a.max(b))))
+    /// The registered images that an image was matched with: of a large scene only neighbours are. Never itself.
+    pub fn registered_neighbours(&self, image: ImageId) -> Vec<ImageId> {
+        match &self.matched {
+            Some(matched) => {
+                let others = matched[image.index()].iter().copied();
+                others.filter(|&other| other != image && self.is_registered(other)).collect()
+            }
+            None => self.registered().filter(|&other| other != image).collect(),
+        }
     }
 
     pub fn is_registered(&self, image: ImageId) -> bool {
@@ -234,6 +247,15 @@ impl<'a> Model<'a> {
         ids.filter(|&(_, &id)| id != NO_POINT).map(|(feature, &id)| (feature as u32, PointId(id))).collect()
     }
 
+    /// The points that any of these images sees, ascending.
+    pub fn seen_by(&self, images: &[ImageId]) -> Vec<PointId> {
+        let seen = images.iter().flat_map(|image| &self.point_of_feature[image.index()]);
+        let mut ids: Vec<PointId> = seen.filter(|&&id| id != NO_POINT).map(|&id| PointId(id)).collect();
+        ids.sort_unstable();
+        ids.dedup();
+        ids
+    }
+
     /// Number of triangulated keypoints of an image.
     pub fn observed_points(&self, image: ImageId) -> usize {
         self.point_of_feature[image.index()].iter().filter(|&&id| id != NO_POINT).count()
@@ -241,11 +263,12 @@ impl<'a> Model<'a> {
 
     /// Recomputes the rays of every image that uses `camera` after its intrinsics have changed.
     pub fn refresh_rays(&mut self, camera: usize) {
-        for (index, image) in self.input.images.iter().enumerate() {
+        let camera_now = &self.cameras[camera];
+        self.rays.par_iter_mut().zip(&self.input.images).for_each(|(rays, image)| {
             if image.camera.index() == camera {
-                self.rays[index] = image.features.rays(&self.cameras[camera]);
+                *rays = image.features.rays(camera_now);
             }
-        }
+        });
     }
 
     /// The finished component: points in creation order, tracks sorted, colours averaged.

@@ -49,12 +49,18 @@ impl Visibility {
     }
 }
 
+/// Number of 2D-to-3D matches that [`scene_matches`] would find.
+pub(super) fn count_scene_matches(model: &Model<'_>, graph: &CorrespondenceGraph, image: ImageId) -> usize {
+    // Most images wait far from the model.
+    let partners = graph.partners_of(image);
+    if !partners.iter().any(|partner| model.is_registered(partner.image)) {
+        return 0;
+    }
+    scene_matches(model, graph, image).len()
+}
+
 /// 2D-to-3D matches of an unregistered image through its verified pairs.
-pub(super) fn scene_matches(
-    model: &Model<'_>,
-    graph: &CorrespondenceGraph,
-    image: ImageId,
-) -> Vec<(u32, PointId)> {
+fn scene_matches(model: &Model<'_>, graph: &CorrespondenceGraph, image: ImageId) -> Vec<(u32, PointId)> {
     let mut matches = Vec::new();
     for feature in 0..model.input.images[image.index()].features.len() as u32 {
         let start = matches.len();
@@ -283,28 +289,27 @@ pub(super) fn visibility(
     let center = world_from_camera.translation;
     let mut counts = Visibility::default();
     let mut cells = vec![(0_usize, 0_usize); direction::CELLS];
-    for (id, point) in model.live_points() {
-        let familiar = point.track.iter().any(|seen| {
-            model.poses[seen.image.index()].as_ref().is_some_and(|pose| {
-                seen.image != image
-                    && model.was_matched(seen.image, image)
-                    && is_same_view(&point.position, pose.center(), &center)
-            })
-        });
-        if !familiar {
-            continue;
-        }
-        let direction = world_from_camera.inverse_transform_point(&point.position);
-        let in_image = match model.input.images[image.index()].mosaic {
-            Some(mosaic) => mosaic.covers(&direction),
-            None => in_view(camera, &direction),
-        };
-        if in_image {
-            counts.expected += 1;
-            counts.matched += usize::from(is_inlier[id.index()]);
-            if let Some(cell) = direction::cell(&(point.position - center)) {
-                cells[cell].0 += 1;
-                cells[cell].1 += usize::from(is_inlier[id.index()]);
+    let mut familiar = vec![false; model.points.len()];
+    for other in model.registered_neighbours(image) {
+        let Some(pose) = &model.poses[other.index()] else { continue };
+        for (_, id) in model.observations_of(other) {
+            let Some(point) = model.point(id).filter(|_| !familiar[id.index()]) else { continue };
+            if !is_same_view(&point.position, pose.center(), &center) {
+                continue;
+            }
+            familiar[id.index()] = true;
+            let direction = world_from_camera.inverse_transform_point(&point.position);
+            let in_image = match model.input.images[image.index()].mosaic {
+                Some(mosaic) => mosaic.covers(&direction),
+                None => in_view(camera, &direction),
+            };
+            if in_image {
+                counts.expected += 1;
+                counts.matched += usize::from(is_inlier[id.index()]);
+                if let Some(cell) = direction::cell(&(point.position - center)) {
+                    cells[cell].0 += 1;
+                    cells[cell].1 += usize::from(is_inlier[id.index()]);
+                }
             }
         }
     }

@@ -1,3 +1,6 @@
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
 use super::{correspondence::CorrespondenceGraph, model::Model};
 use crate::{ImageId, Observation, PointId};
 
@@ -8,29 +11,75 @@ pub(super) struct PointLimits {
     pub min_angle_rad: f64,
 }
 
+/// Points that are worth handing to another thread.
+const POINTS_PER_TASK: usize = 256;
+
+/// What becomes of a free keypoint.
+enum Step {
+    /// It is another observation of a point.
+    Continue(PointId),
+    /// It makes a new point, with these others.
+    Create(Vector3<f64>, Vec<Observation>),
+}
+
 /// Continues existing points into `image` and creates new ones from its unexplained matches.
+///
+/// One keypoint after the other; but as few stand in each other's way, what becomes of them is found for all at once,
+/// and found again where an earlier one has changed what it depends on.
 pub(super) fn triangulate_image(
     model: &mut Model<'_>,
     graph: &CorrespondenceGraph,
     limits: PointLimits,
     image: ImageId,
 ) {
-    let mut candidates = Vec::new();
-    for feature in 0..model.input.images[image.index()].features.len() as u32 {
-        let seed = Observation { image, feature };
-        if model.point_of(seed).is_none() && !continue_point(model, graph, limits, seed) {
-            create_point(model, graph, limits, seed, &mut candidates);
+    let step_of = |model: &Model<'_>, seed: Observation| -> Option<Step> {
+        if model.point_of(seed).is_some() {
+            return None;
+        }
+        continuation(model, graph, limits, seed)
+            .map(Step::Continue)
+            .or_else(|| new_point(model, graph, limits, seed))
+    };
+    let features = 0..model.input.images[image.index()].features.len() as u32;
+    let steps: Vec<Option<Step>> = features
+        .into_par_iter()
+        .with_min_len(POINTS_PER_TASK)
+        .map(|feature| step_of(model, Observation { image, feature }))
+        .collect();
+    let first_new = model.points.len();
+    for (feature, mut step) in steps.into_iter().enumerate() {
+        let seed = Observation { image, feature: feature as u32 };
+        if model.point_of(seed).is_some() {
+            continue;
+        }
+        let is_new =
+            |partner: &Observation| model.point_of(*partner).is_some_and(|id| id.index() >= first_new);
+        let taken = match &step {
+            Some(Step::Continue(id)) => model.point(*id).is_none_or(|point| sees(&point.track, image)),
+            _ => false,
+        };
+        if taken || graph.partners(image, seed.feature).iter().any(is_new) {
+            step = step_of(model, seed);
+        }
+        match step {
+            Some(Step::Continue(id)) => model.add_observation(id, seed),
+            Some(Step::Create(position, track)) => drop(model.add_point(position, track)),
+            None => {}
         }
     }
 }
 
-/// Adds `seed` to the partner's point that it agrees with best.
-fn continue_point(
-    model: &mut Model<'_>,
+fn sees(track: &[Observation], image: ImageId) -> bool {
+    track.iter().any(|seen| seen.image == image)
+}
+
+/// The partner's point that `seed` agrees with best.
+fn continuation(
+    model: &Model<'_>,
     graph: &CorrespondenceGraph,
     limits: PointLimits,
     seed: Observation,
-) -> bool {
+) -> Option<PointId> {
     let mut best: Option<(f64, PointId)> = None;
     for &partner in graph.partners(seed.image, seed.feature) {
         let Some(id) = model.point_of(partner) else { continue };
@@ -38,31 +87,26 @@ fn continue_point(
         let Some(error) = model.error_sigma(seed, &point.position) else { continue };
         if error <= limits.max_error_sigma
             && best.is_none_or(|(lowest, _)| error < lowest)
-            && !point.track.iter().any(|seen| seen.image == seed.image)
+            && !sees(&point.track, seed.image)
         {
             best = Some((error, id));
         }
     }
-    if let Some((_, id)) = best {
-        model.add_observation(id, seed);
-    }
-    best.is_some()
+    best.map(|(_, id)| id)
 }
 
 /// Triangulates `seed` with each free partner and keeps the hypothesis that most of the others support.
-fn create_point(
-    model: &mut Model<'_>,
+fn new_point(
+    model: &Model<'_>,
     graph: &CorrespondenceGraph,
     limits: PointLimits,
     seed: Observation,
-    candidates: &mut Vec<Observation>,
-) {
-    candidates.clear();
-    candidates.push(seed);
+) -> Option<Step> {
+    let mut candidates = vec![seed];
     for &partner in graph.partners(seed.image, seed.feature) {
         if model.is_registered(partner.image)
             && model.point_of(partner).is_none()
-            && !candidates.iter().any(|seen| seen.image == partner.image)
+            && !sees(&candidates, partner.image)
         {
             candidates.push(partner);
         }
@@ -92,13 +136,11 @@ fn create_point(
             best = Some((support.len(), hypothesis.max_angle_rad, support));
         }
     }
-    let Some((_, _, support)) = best else { return };
-    if let Some(refined) = model.triangulate(&support)
-        && refined.max_error_sigma <= limits.max_error_sigma
-        && refined.max_angle_rad >= limits.min_angle_rad
-    {
-        model.add_point(refined.position, support);
-    }
+    let (_, _, support) = best?;
+    let refined = model.triangulate(&support)?;
+    let keeps =
+        refined.max_error_sigma <= limits.max_error_sigma && refined.max_angle_rad >= limits.min_angle_rad;
+    keeps.then_some(Step::Create(refined.position, support))
 }
 
 /// Extends every point along its matches and merges points that turn out to be one. Returns the changes made.
@@ -129,7 +171,7 @@ pub(super) fn complete_and_merge(
 
 fn complete(model: &mut Model<'_>, limits: PointLimits, id: PointId, partner: Observation) -> bool {
     let Some(point) = model.point(id) else { return false };
-    let agrees = !point.track.iter().any(|seen| seen.image == partner.image)
+    let agrees = !sees(&point.track, partner.image)
         && model.error_sigma(partner, &point.position).is_some_and(|error| error <= limits.max_error_sigma);
     if agrees {
         model.add_observation(id, partner);
@@ -161,26 +203,28 @@ fn merge(model: &mut Model<'_>, limits: PointLimits, id: PointId, other: PointId
     }
 }
 
-/// Drops observations and points that violate the limits. Returns the observations dropped.
-pub(super) fn filter(model: &mut Model<'_>, limits: PointLimits) -> usize {
+/// Drops what violates the limits among these points and their observations. Returns the observations dropped.
+pub(super) fn filter(model: &mut Model<'_>, limits: PointLimits, points: &[PointId]) -> usize {
+    let judge = |&id: &PointId| {
+        let point = model.point(id)?;
+        let agrees = |seen: &Observation| {
+            model.error_sigma(*seen, &point.position).is_some_and(|error| error <= limits.max_error_sigma)
+        };
+        let (kept, bad): (Vec<Observation>, Vec<Observation>) =
+            point.track.iter().partition(|seen| agrees(seen));
+        let stays = kept.len() >= 2 && model.max_angle(&point.position, &kept) >= limits.min_angle_rad;
+        (!stays || !bad.is_empty()).then_some((id, stays, bad))
+    };
+    let judged: Vec<_> = points.par_iter().with_min_len(POINTS_PER_TASK).filter_map(judge).collect();
     let mut dropped = 0;
-    for id in model.live_ids() {
+    for (id, stays, bad) in judged {
         let Some(point) = model.point(id) else { continue };
-        let bad: Vec<Observation> = point
-            .track
-            .iter()
-            .copied()
-            .filter(|&seen| {
-                !model.error_sigma(seen, &point.position).is_some_and(|error| error <= limits.max_error_sigma)
-            })
-            .collect();
-        dropped += bad.len();
-        for observation in bad {
-            model.remove_observation(id, observation);
-        }
-        let Some(point) = model.point(id) else { continue };
-        if point.track.len() < 2 || !(model.max_angle(&point.position, &point.track) >= limits.min_angle_rad)
-        {
+        if stays {
+            dropped += bad.len();
+            for observation in bad {
+                model.remove_observation(id, observation);
+            }
+        } else {
             dropped += point.track.len();
             model.remove_point(id);
         }
