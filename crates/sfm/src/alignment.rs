@@ -34,7 +34,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 5;
+pub const ALIGNMENT_VERSION: u32 = 6;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;
@@ -111,7 +111,8 @@ pub struct AlignmentReport {
 /// `features` are those of the component's images, by id; `camera_fixed` says whose intrinsics are known. `load` gives
 /// the pixels of a registered image and may be called five times for each, from several threads.
 ///
-/// A component in which photos share a standpoint is left as it is: what ties their centres together is not known here.
+/// In a component in which photos share a standpoint nothing moves, as what ties their centres together is not known
+/// here: its points get their places only.
 ///
 /// # Errors
 /// The first of `load`, in the order of images; the component may then be adjusted by its own views only.
@@ -123,9 +124,6 @@ pub fn align_tracks<E: Send>(
     load: impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync,
 ) -> Result<AlignmentReport, E> {
     let registered: Vec<ImageId> = component.registered().collect();
-    if shares_standpoints(component, &registered) {
-        return Ok(AlignmentReport::default());
-    }
     let mut tracks = Tracks::new(params, component, features);
     // The first alignment tells the slant of the surfaces, the second goes by it.
     let (_, facing) = tracks.align_all(&registered, &load)?;
@@ -140,6 +138,13 @@ pub fn align_tracks<E: Send>(
         .filter(|(template, _)| template.is_some())
         .map(|(_, point)| point.track.len() - 1)
         .sum();
+    if shares_standpoints(component, &registered) {
+        let placed = tracks.placed(&aligned, &tracks.middles(&aligned), &[]);
+        for (point, placed) in component.points.iter_mut().zip(placed) {
+            point.aligned = placed.map(|(aligned, _)| aligned);
+        }
+        return Ok(report);
+    }
     let bundle = BundleParams {
         loss: RobustLoss::Cauchy(params.loss_sigma),
         max_iterations: params.max_iterations,
