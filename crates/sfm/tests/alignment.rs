@@ -148,6 +148,26 @@ fn pixels_place_the_cameras_better_than_keypoints() {
     let (before, after) = (room.error(&keypoints), room.error(&pixels));
     assert!(after < before / 3.0, "{before} {after}");
     assert_eq!(pixels.points[0].track, room.model.points[0].track);
+    // The places of a point agree on it better than the keypoints did.
+    let pixels = &pixels;
+    let mean_error = |place: &dyn Fn(usize, usize) -> Option<Vector2<f64>>| {
+        let seen = pixels.points.iter().enumerate().flat_map(|(index, point)| {
+            point.track.iter().enumerate().filter_map(move |(at, seen)| {
+                let pose = pixels.images[seen.image.index()].world_from_camera?;
+                let in_camera = pose.inverse_transform_point(&point.position);
+                let projected = pixels.cameras[0].project(&in_camera)?;
+                Some((projected - place(index, at)?).norm()).filter(|error| *error < 10.0)
+            })
+        });
+        let errors: Vec<f64> = seen.collect();
+        errors.iter().sum::<f64>() / errors.len() as f64
+    };
+    let by_pixels = mean_error(&|index, at| Some(pixels.points[index].aligned.as_ref()?.places[at].pixel));
+    let by_keypoints = mean_error(&|index, at| {
+        let seen = pixels.points[index].track[at];
+        Some(room.features[seen.image.index()].keypoints[seen.feature as usize].pixel())
+    });
+    assert!(by_pixels < 0.5 * by_keypoints, "{by_pixels} {by_keypoints}");
 }
 
 #[test]
@@ -173,15 +193,26 @@ fn keypoints_without_their_surroundings_stay() {
 }
 
 #[test]
-fn photos_of_one_standpoint_and_unreadable_images_leave_the_model_alone() {
-    let mut room = Room::new("photos_of_one_standpoint_and_unreadable_images_leave_the_model_alone");
-    let features = room.features.clone();
-    let features: Vec<&ImageFeatures> = features.iter().collect();
+fn unreadable_images_leave_the_model_alone() {
+    let room = Room::new("unreadable_images_leave_the_model_alone");
+    let features: Vec<&ImageFeatures> = room.features.iter().collect();
     let mut model = room.model.clone();
     let load = |image: ImageId| if image.0 == 2 { Err("gone") } else { Ok(Arc::clone(&room.pyramids[0])) };
     let failed = align_tracks(&AlignmentParams::default(), &mut model, &features, &[true], load);
     assert_eq!((failed, &model), (Err("gone"), &room.model));
+}
+
+#[test]
+fn photos_of_one_standpoint_stay_and_their_points_get_places() {
+    let mut room = Room::new("photos_of_one_standpoint_stay_and_their_points_get_places");
     let center = room.model.images[0].world_from_camera.unwrap().translation;
     room.model.images[3].world_from_camera.as_mut().unwrap().translation = center;
-    assert_eq!(room.align(&AlignmentParams::default()), (room.model.clone(), AlignmentReport::default()));
+    let (mut model, report) = room.align(&AlignmentParams::default());
+    assert!(report.points > 0 && report.further == 0, "{report:?}");
+    let aligned: Vec<_> = model.points.iter_mut().map(|point| point.aligned.take()).collect();
+    assert_eq!(model, room.model);
+    assert_eq!(aligned.iter().flatten().count(), report.points);
+    for (point, aligned) in model.points.iter().zip(&aligned) {
+        assert!(aligned.as_ref().is_none_or(|aligned| aligned.places.len() == point.track.len()));
+    }
 }
