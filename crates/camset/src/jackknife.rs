@@ -37,11 +37,9 @@ pub(crate) fn honest_covariances(
     // What was chosen are inliers: each counts in full.
     let mut covariances = stated(problem, RobustLoss::Trivial);
     let mut parts = without_groups(params, problem);
-    let contradicts = |covariances: &[Option<Matrix6<f64>>], found: &[Matrix6<f64>]| {
-        covariances.iter().flatten().zip(found).any(|(stated, found)| contradicts(stated, found))
-    };
     let mut found = jackknife(problem, &parts, poses);
-    if contradicts(&covariances, &found) {
+    let mut pairs = covariances.iter().zip(&found);
+    if pairs.any(|(stated, found)| stated.is_some_and(|stated| contradicts(&stated, found))) {
         let sharp = BundleParams { loss: RobustLoss::Cauchy(SHARP_LOSS), ..*params };
         *problem = best_of(&sharp, problem, &parts);
         covariances = stated(problem, params.loss);
@@ -49,7 +47,7 @@ pub(crate) fn honest_covariances(
         found = jackknife(problem, &parts, poses);
     }
     let honest = |(stated, found): (Option<Matrix6<f64>>, &Matrix6<f64>)| {
-        stated.map(|stated| if self::contradicts(&stated, found) { stated + found } else { stated })
+        stated.map(|stated| if contradicts(&stated, found) { stated + found } else { stated })
     };
     covariances.into_iter().zip(&found).map(honest).collect()
 }
@@ -97,7 +95,8 @@ fn contradicts(stated: &Matrix6<f64>, found: &Matrix6<f64>) -> bool {
     (information * found).trace() / 6.0 > CONTRADICTION
 }
 
-fn deviation(from: &Rigid, to: &Rigid) -> Vector6<f64> {
+/// Rotation in the camera frame, then centre, that lead from one pose to another.
+pub(crate) fn deviation(from: &Rigid, to: &Rigid) -> Vector6<f64> {
     let turn = (from.rotation.inverse() * to.rotation).scaled_axis();
     let shift = to.translation - from.translation;
     Vector6::new(turn.x, turn.y, turn.z, shift.x, shift.y, shift.z)
@@ -167,5 +166,23 @@ mod tests {
             assert!(off < 3.0 * honest.fixed_view::<3, 3>(3, 3).trace().sqrt(), "{seed}: {off}");
         }
         assert!(widened > 0);
+    }
+    #[test]
+    fn a_pose_without_covariance_does_not_hide_the_next() {
+        let mut alone = photo(3.0, 1, 0);
+        let (_, expected) = found(&mut alone);
+        let mut second = photo(3.0, 1, 0);
+        second.poses.insert(0, BundlePose { fixed: true, ..second.poses[0] });
+        for seen in &mut second.observations {
+            seen.pose = 1;
+        }
+        let params = BundleParams { loss: RobustLoss::Cauchy(1.0), ..BundleParams::default() };
+        bundle::solve(&params, &mut second);
+        let stated = |problem: &BundleProblem, loss| {
+            vec![None, bundle::covariance(problem, loss, &[1]).map(|covariances| covariances[0])]
+        };
+        let honest = honest_covariances(&params, &mut second, 2, stated);
+        assert_eq!(honest[0], None);
+        assert!((honest[1].unwrap() - expected).norm() < 1e-6 * expected.norm());
     }
 }

@@ -181,6 +181,7 @@ mod tests {
 
     use super::*;
     use crate::CamsetMethod;
+    use crate::jackknife::deviation;
     use crate::test_scene::{Place, World, along_street};
 
     fn locate(world: &World, params: &CamsetParams) -> SetLocalization {
@@ -350,10 +351,7 @@ mod tests {
             for (sum, photo) in sums.iter_mut().zip([5, 0]) {
                 let answer = &found.refined[photo];
                 let (pose, covariance) = (answer.world_from_camera.unwrap(), answer.covariance.unwrap());
-                let truth = &world.photos[photo].pose;
-                let turn = (pose.rotation.inverse() * truth.rotation).scaled_axis();
-                let shift = truth.translation - pose.translation;
-                let error = nalgebra::Vector6::new(turn.x, turn.y, turn.z, shift.x, shift.y, shift.z);
+                let error = deviation(&pose, &world.photos[photo].pose);
                 *sum += error.dot(&(covariance.try_inverse().unwrap() * error)) / 6.0;
             }
         }
