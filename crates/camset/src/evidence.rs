@@ -47,8 +47,7 @@ impl<'a> PhotoRays<'a> {
 
     /// Where a keypoint is, with its noise.
     pub(crate) fn place_of(&self, feature: u32) -> Place {
-        let keypoint = &self.features.keypoints[feature as usize];
-        Place { pixel: keypoint.pixel(), noise_px: f64::from(keypoint.noise_px) }
+        Place::from(&self.features.keypoints[feature as usize])
     }
 
     /// Error of a place that shows a point, in standard deviations of a keypoint and of the point together.

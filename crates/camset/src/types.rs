@@ -40,6 +40,17 @@ pub enum Verdict {
     NotLocalized,
 }
 
+impl Verdict {
+    /// As people say it.
+    pub fn in_words(self) -> &'static str {
+        match self {
+            Self::Localized => "localized",
+            Self::Uncertain => "uncertain",
+            Self::NotLocalized => "not localized",
+        }
+    }
+}
+
 /// Where one photo is.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PhotoLocalization {

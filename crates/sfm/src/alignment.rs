@@ -197,7 +197,7 @@ fn shares_standpoints(component: &Reconstruction, registered: &[ImageId]) -> boo
 }
 
 /// Templates by point, and where the views show them by point and place in the track.
-type AlignedTracks = (Templates, Vec<Vec<Option<Aligned>>>);
+type Alignments = (Templates, Vec<Vec<Option<Aligned>>>);
 type Templates = Vec<Option<Box<Template>>>;
 
 /// A component with what is asked of its tracks.
@@ -328,7 +328,7 @@ impl<'a> Tracks<'a> {
         &self,
         registered: &[ImageId],
         load: &(impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync),
-    ) -> Result<AlignedTracks, E> {
+    ) -> Result<Alignments, E> {
         let cut = in_each(registered, load, |image, pyramid| self.cut(image, pyramid))?;
         let mut templates: Templates = vec![None; self.component.points.len()];
         for (point, template) in cut.into_iter().flatten() {
@@ -510,7 +510,7 @@ impl<'a> Tracks<'a> {
             let pixel = pixel + self.pixel_from_plane(point, observation.image)? * middle.offset;
             Some(Place { pixel, noise_px })
         });
-        placed.unwrap_or_else(|| Place { pixel: keypoint.pixel(), noise_px: f64::from(keypoint.noise_px) })
+        placed.unwrap_or_else(|| keypoint.into())
     }
 
     fn middles(&self, aligned: &[Vec<Option<Aligned>>]) -> Vec<Option<Middle>> {

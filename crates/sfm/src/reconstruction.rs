@@ -1,6 +1,6 @@
 use nalgebra::{Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
-use setloc_features::Camera;
+use setloc_features::{Camera, Keypoint};
 
 use crate::{Rigid, Similarity};
 
@@ -94,6 +94,12 @@ pub struct Reconstruction {
     pub images: Vec<ReconstructionImage>,
     /// Triangulated points.
     pub points: Vec<ReconstructionPoint>,
+}
+
+impl From<&Keypoint> for Place {
+    fn from(keypoint: &Keypoint) -> Self {
+        Self { pixel: keypoint.pixel(), noise_px: f64::from(keypoint.noise_px) }
+    }
 }
 
 impl Reconstruction {

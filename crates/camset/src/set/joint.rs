@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix3, Matrix6};
 use rayon::prelude::*;
-use setloc_features::Camera;
+use setloc_features::{Camera, Keypoint};
 use setloc_sfm::{ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
 
 use super::PhotoEvidence;
@@ -422,28 +422,29 @@ impl Component<'_> {
 
     /// Slots and features that see a local point.
     fn track(&self, local: usize) -> Vec<(usize, u32)> {
-        self.model.points[local]
-            .track
-            .iter()
-            .filter_map(|o| Some((self.members.binary_search(&o.image.index()).ok()?, o.feature)))
-            .filter(|&(slot, feature)| (feature as usize) < self.photos[self.members[slot]].features.len())
-            .collect()
+        self.seen_by_keypoints(local).map(|(_, slot, feature, _)| (slot, feature)).collect()
+    }
+
+    /// The keypoints of a local point: place in its track, slot, feature and the keypoint.
+    fn seen_by_keypoints(&self, local: usize) -> impl Iterator<Item = (usize, usize, u32, &Keypoint)> {
+        self.model.points[local].track.iter().enumerate().filter_map(|(at, seen)| {
+            let slot = self.members.binary_search(&seen.image.index()).ok()?;
+            let keypoints = &self.photos[self.members[slot]].features.keypoints;
+            Some((at, slot, seen.feature, keypoints.get(seen.feature as usize)?))
+        })
     }
 
     /// Where the photos show a local point: by their pixels where it is aligned, else by their keypoints.
     fn sightings(&self, local: usize) -> Vec<Sighting> {
         let point = &self.model.points[local];
-        let features = |slot: usize| self.photos[self.members[slot]].features;
         let slot_of = |image: ImageId| self.members.binary_search(&image.index()).ok();
-        let by_keypoint = point.track.iter().enumerate().filter_map(|(at, seen)| {
-            let photo = slot_of(seen.image)?;
-            let keypoint = features(photo).keypoints.get(seen.feature as usize)?;
-            let keypoint_noise_px = f64::from(keypoint.noise_px);
+        let by_keypoint = self.seen_by_keypoints(local).filter_map(|(at, photo, feature, keypoint)| {
+            let own = Place::from(keypoint);
             let place = match &point.aligned {
                 Some(aligned) => *aligned.places.get(at)?,
-                None => Place { pixel: keypoint.pixel(), noise_px: keypoint_noise_px },
+                None => own,
             };
-            Some(Sighting { photo, feature: Some(seen.feature), place, keypoint_noise_px })
+            Some(Sighting { photo, feature: Some(feature), place, keypoint_noise_px: own.noise_px })
         });
         let mut sightings: Vec<Sighting> = by_keypoint.collect();
         if let Some(aligned) = &point.aligned {

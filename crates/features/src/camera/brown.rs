@@ -7,6 +7,7 @@
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x4, Matrix3x2, Vector2, Vector3};
 
 use super::lens::{Distorted, MIN_SLOPE, Undistorted};
+use super::newton::invert_growing;
 
 const MAX_ITERATIONS: usize = 100;
 
@@ -125,10 +126,9 @@ fn is_inside(n: &Vector2<f64>, terms: &[f64; 4]) -> bool {
     j.trace() > 0.0 && j.determinant() > MIN_SLOPE * MIN_SLOPE
 }
 
-/// The radius whose distorted radius is `distorted`, by Newton kept inside a bracket.
+/// The radius whose distorted radius is `distorted`.
 fn invert_radius(distorted: f64, k1: f64, k2: f64) -> Option<f64> {
     let radius_of = |r: f64| r * (1.0 + r * r * (k1 + r * r * k2));
-    let mut low = 0.0;
     let mut high = domain_end(k1, k2).sqrt();
     if high.is_finite() {
         if distorted > radius_of(high) {
@@ -142,22 +142,8 @@ fn invert_radius(distorted: f64, k1: f64, k2: f64) -> Option<f64> {
     }
     // Far out the highest power is all there is; Newton from the distorted radius would need a step for each fifth.
     let far = if k2 > 0.0 { (distorted / k2).powf(0.2) } else { (distorted / k1.max(0.0)).cbrt() };
-    let mut r = distorted.min(high).min(far);
-    for _ in 0..MAX_ITERATIONS {
-        let residual = radius_of(r) - distorted;
-        if residual > 0.0 {
-            high = r;
-        } else {
-            low = r;
-        }
-        let newton = r - residual / radial_slope(r * r, k1, k2);
-        let next = if (low..=high).contains(&newton) { newton } else { f64::midpoint(low, high) };
-        if (next - r).abs() <= 2.0 * f64::EPSILON * r {
-            return Some(next);
-        }
-        r = next;
-    }
-    Some(r)
+    let slope_of = |r: f64| radial_slope(r * r, k1, k2);
+    Some(invert_growing(distorted, radius_of, slope_of, [0.0, high], distorted.min(high).min(far)))
 }
 
 fn invert(point: &Vector2<f64>, terms: &[f64; 4]) -> Option<Vector2<f64>> {

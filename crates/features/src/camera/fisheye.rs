@@ -9,8 +9,8 @@ use std::f64::consts::PI;
 use nalgebra::{Matrix2x3, Matrix2x4, Matrix3x2, Matrix3x4, Vector2, Vector3};
 
 use super::lens::{Distorted, MIN_SLOPE, Undistorted};
+use super::newton::invert_growing;
 
-const MAX_ITERATIONS: usize = 100;
 /// Steps of the search for the first angle at which the curve stops growing.
 const DOMAIN_STEPS: usize = 128;
 
@@ -132,29 +132,14 @@ fn domain_end(needed: f64, terms: &[f64; 4]) -> f64 {
     PI
 }
 
-/// The angle whose curve value is `radius`, by Newton kept inside a bracket.
+/// The angle whose curve value is `radius`.
 fn invert(radius: f64, terms: &[f64; 4]) -> Option<f64> {
-    let mut low = 0.0;
-    let mut high = domain_end(PI, terms);
+    let high = domain_end(PI, terms);
     let border = curve(high, terms);
     let is_inside = radius < border || (radius == border && high < PI);
     if !is_inside {
         return None;
     }
-    let mut theta = radius.min(high);
-    for _ in 0..MAX_ITERATIONS {
-        let residual = curve(theta, terms) - radius;
-        if residual > 0.0 {
-            high = theta;
-        } else {
-            low = theta;
-        }
-        let newton = theta - residual / slope(theta, terms);
-        let next = if (low..=high).contains(&newton) { newton } else { f64::midpoint(low, high) };
-        if (next - theta).abs() <= 2.0 * f64::EPSILON * theta {
-            return Some(next);
-        }
-        theta = next;
-    }
-    Some(theta)
+    let (curve, slope) = (|theta| curve(theta, terms), |theta| slope(theta, terms));
+    Some(invert_growing(radius, curve, slope, [0.0, high], radius.min(high)))
 }

@@ -3,6 +3,7 @@ mod equirectangular;
 mod fisheye;
 mod lens;
 mod model;
+mod newton;
 mod paper_rectilinear;
 #[cfg(test)]
 mod tests;

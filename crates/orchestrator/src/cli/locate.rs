@@ -56,7 +56,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Located, Answer)> {
     let answer = answers.iter().find(|(_, photo)| photo.name == target);
     let verdict = answer.map_or(Verdict::NotLocalized, |(_, photo)| photo.verdict);
     let found = verdict == Verdict::Localized;
-    print::note(&format!("target {target}: {}", word(verdict)));
+    print::note(&format!("target {target}: {}", verdict.in_words()));
     Ok((located, if found { Answer::Done } else { Answer::Negative }))
 }
 
@@ -77,17 +77,9 @@ fn find_target(wanted: Option<&str>, files: &[(String, std::path::PathBuf)]) -> 
     })
 }
 
-fn word(verdict: Verdict) -> &'static str {
-    match verdict {
-        Verdict::Localized => "localized",
-        Verdict::Uncertain => "uncertain",
-        Verdict::NotLocalized => "not localized",
-    }
-}
-
 /// Tab-separated: name, verdict, method, inliers, centre, rotation.
 fn line(method: &str, photo: &PhotoLocalization) -> String {
-    let verdict = word(photo.verdict);
+    let verdict = photo.verdict.in_words();
     let pose = photo.world_from_camera.as_ref().map_or_else(String::new, |pose| {
         let (c, q) = (pose.translation, pose.rotation.quaternion());
         format!("\t{:.4} {:.4} {:.4}\t{:.6} {:.6} {:.6} {:.6}", c.x, c.y, c.z, q.w, q.i, q.j, q.k)

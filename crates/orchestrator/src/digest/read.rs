@@ -177,11 +177,12 @@ fn of_scene(name: &str, scene: ScenePoses, skipped: Vec<SkippedImage>) -> Digest
 
 fn of_photos(name: &str, located: LocatedPoses) -> Digest {
     let row = |photo: Photo| {
-        let (standing, verdict) = match photo.verdict {
-            Verdict::Localized => (Standing::Good, "localized"),
-            Verdict::Uncertain => (Standing::Weak, "uncertain"),
-            Verdict::NotLocalized => (Standing::Bad, "not localized"),
+        let standing = match photo.verdict {
+            Verdict::Localized => Standing::Good,
+            Verdict::Uncertain => Standing::Weak,
+            Verdict::NotLocalized => Standing::Bad,
         };
+        let verdict = photo.verdict.in_words();
         let precision = photo.sigma.map_or_else(String::new, |sigma| {
             format!(", σ {:.3} and {:.3}°", sigma.position, sigma.rotation_deg)
         });
