@@ -20,6 +20,8 @@ use crate::session::Session;
 pub struct Built {
     /// The scene.
     pub scene: Arc<SceneFile>,
+    /// The bytes of its file.
+    pub file: Vec<u8>,
     /// Its content hash.
     pub hash: ContentHash,
     /// Images that are not in it, and why.
@@ -78,9 +80,10 @@ pub fn build_scene(
             let made = made.filter(|(_, job)| executor.output(**job).is_some());
             made.map(|(image, job)| Ok((image.name.clone(), executor.load::<ImageFeatures>(*job)?))).collect()
         };
-        let (scene, features): (_, Result<BTreeMap<_, _>>) =
-            rayon::join(|| executor.load::<SceneFile>(jobs.scene), load_features);
-        let (scene, features) = (scene?, features?);
-        Ok(BuildOutcome::Built(Box::new(Built { scene, hash, skipped, features, run: run.clone() })))
+        let load_scene =
+            || Ok((executor.load::<SceneFile>(jobs.scene)?, executor.file::<SceneFile>(jobs.scene)?));
+        let (scene, features): (Result<_>, Result<BTreeMap<_, _>>) = rayon::join(load_scene, load_features);
+        let ((scene, file), features) = (scene?, features?);
+        Ok(BuildOutcome::Built(Box::new(Built { scene, file, hash, skipped, features, run: run.clone() })))
     })
 }

@@ -1,10 +1,13 @@
 //! The content-addressed store: results of jobs, found again by fingerprint.
 //!
-//! `objects/ab/<hash>` holds artifact files by the hash of their content, `keys/ab/<key>.json` the readable
-//! fingerprint of a job with the hash of its output, `runs/<name>.json` which job had which key in the last run of
-//! that name.
+//! `objects/ab/<hash>` holds artifact files by the hash of their content, `keys/<hash>.jsonl` the readable fingerprints
+//! of jobs with the hash of their output, a line each, `runs/<name>.json` which job had which key in the last run of
+//! that name. Small artifacts are in their job's record itself, and jobs that end at about the same time share a file of
+//! records: making and syncing a file costs as much as many a job.
 //! Every file is written beside its place, synced and renamed, so a reader sees a whole file or none, two processes
 //! at once at worst do the same work twice, and nothing has to be locked.
+
+mod records;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -18,15 +21,19 @@ use serde::{Deserialize, Serialize};
 use crate::error::Hinted;
 use crate::fingerprint::{ContentHash, Fingerprint};
 
-/// What is known of a finished job.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct KeyRecord {
-    /// What the output is a function of.
-    pub fingerprint: Fingerprint,
-    /// Hash of the output's file.
-    pub output: ContentHash,
-    /// Size of the output's file in bytes.
-    pub bytes: u64,
+use records::Records;
+
+pub use records::KeyRecord;
+
+/// A job's result to be kept.
+#[derive(Debug, Clone, Copy)]
+pub struct Output<'a> {
+    /// What it is a function of.
+    pub fingerprint: &'a Fingerprint,
+    /// Hash of its file.
+    pub hash: ContentHash,
+    /// Its file.
+    pub file: &'a [u8],
     /// CPU seconds that making it took.
     pub cpu_secs: f64,
 }
@@ -40,7 +47,7 @@ pub struct StoreSummary {
     pub orphans: usize,
     /// Files that a killed process left half written.
     pub unfinished: usize,
-    /// Bytes of all objects.
+    /// Bytes of all outputs, those in records too.
     pub bytes: u64,
 }
 
@@ -48,6 +55,7 @@ pub struct StoreSummary {
 #[derive(Debug, Clone)]
 pub struct Store {
     root: PathBuf,
+    records: Records,
 }
 
 impl Store {
@@ -59,12 +67,12 @@ impl Store {
         for folder in ["objects", "keys", "runs"] {
             create_folder(&root.join(folder))?;
         }
-        Ok(Self { root: root.to_owned() })
+        Ok(Self::at(root))
     }
 
     /// The store in `root` as it is; nothing is made. A missing folder is an empty store.
     pub fn at(root: &Path) -> Self {
-        Self { root: root.to_owned() }
+        Self { root: root.to_owned(), records: Records::at(root.join("keys")) }
     }
 
     /// How runs that make `output` are called: by its place beside the store, so that both can be moved together.
@@ -84,30 +92,33 @@ impl Store {
         self.root.join("objects").join(&name[..2]).join(name)
     }
 
-    fn key_path(&self, key: ContentHash) -> PathBuf {
-        let name = key.to_string();
-        self.root.join("keys").join(&name[..2]).join(format!("{name}.json"))
-    }
-
-    /// The record of a finished job whose output is still here in full length; a damaged record counts as none.
+    /// The record of a finished job whose output is still here, an object in full length; a damaged record counts as
+    /// none.
     pub fn lookup(&self, key: ContentHash) -> Option<KeyRecord> {
-        let record: KeyRecord = serde_json::from_slice(&fs::read(self.key_path(key)).ok()?).ok()?;
-        let length = fs::metadata(self.object_path(record.output)).ok()?.len();
-        (record.fingerprint.key() == key && length == record.bytes).then_some(record)
+        let has_output = |record: &KeyRecord| {
+            let object = || fs::metadata(self.object_path(record.output));
+            record.content().is_some() || object().is_ok_and(|object| object.len() == record.bytes)
+        };
+        self.record(key).filter(has_output)
     }
 
     /// The record of a key whether or not its output is still here.
     pub fn record(&self, key: ContentHash) -> Option<KeyRecord> {
-        serde_json::from_slice(&fs::read(self.key_path(key)).ok()?).ok()
+        self.records.find(key)
     }
 
-    /// The file of an artifact, its hash verified.
+    /// The output's file of the job with this key, its hash verified.
     ///
     /// # Errors
     /// When it is missing, unreadable or damaged.
-    pub fn read(&self, hash: ContentHash) -> Result<Vec<u8>> {
-        let path = self.object_path(hash);
-        let bytes = fs::read(&path).with_context(|| format!("cannot read artifact {hash}"))?;
+    pub fn read(&self, key: ContentHash, hash: ContentHash) -> Result<Vec<u8>> {
+        let bytes = match fs::read(self.object_path(hash)) {
+            Err(error) if error.kind() == ErrorKind::NotFound => {
+                self.record(key).and_then(|record| record.content().map(<[u8]>::to_vec)).ok_or(error)
+            }
+            object => object,
+        };
+        let bytes = bytes.with_context(|| format!("cannot read artifact {hash}"))?;
         anyhow::ensure!(
             ContentHash::of(&bytes) == hash,
             "artifact {hash} is damaged: its content has another hash"
@@ -120,30 +131,26 @@ impl Store {
     /// # Errors
     /// When the disk is full or not writable.
     pub fn write(&self, fingerprint: &Fingerprint, file: &[u8], cpu_secs: f64) -> Result<ContentHash> {
-        let output = ContentHash::of(file);
-        self.keep(fingerprint, output, file, cpu_secs)?;
-        Ok(output)
+        let hash = ContentHash::of(file);
+        self.keep(&[Output { fingerprint, hash, file, cpu_secs }])?;
+        Ok(hash)
     }
 
-    /// As [`Store::write`], with the hash of the file.
+    /// Stores results, their records in one file.
     ///
     /// # Errors
     /// When the disk is full or not writable.
-    pub fn keep(
-        &self,
-        fingerprint: &Fingerprint,
-        output: ContentHash,
-        file: &[u8],
-        cpu_secs: f64,
-    ) -> Result<()> {
-        let path = self.object_path(output);
-        let whole = fs::read(&path).is_ok_and(|old| old == file);
-        if !whole {
-            write_atomically(&path, file)?;
+    pub fn keep(&self, outputs: &[Output<'_>]) -> Result<()> {
+        let mut records = Vec::with_capacity(outputs.len());
+        for &Output { fingerprint, hash, file, cpu_secs } in outputs {
+            let record = KeyRecord::new(fingerprint.clone(), hash, file, cpu_secs);
+            let path = self.object_path(hash);
+            if record.content().is_none() && !fs::read(&path).is_ok_and(|old| old == file) {
+                write_atomically(&path, file)?;
+            }
+            records.push(record);
         }
-        let record =
-            KeyRecord { fingerprint: fingerprint.clone(), output, bytes: file.len() as u64, cpu_secs };
-        write_atomically(&self.key_path(fingerprint.key()), serde_json::to_string_pretty(&record)?.as_bytes())
+        self.records.add(&records)
     }
 
     /// Removes an artifact, as when it was found damaged.
@@ -214,17 +221,6 @@ impl Store {
         self.root.join("runs").join(format!("{}-{}.json", readable.trim_start_matches('.'), &hash[..8]))
     }
 
-    /// All records.
-    fn records(&self) -> Result<Vec<(PathBuf, KeyRecord)>> {
-        let mut records = Vec::new();
-        for path in files_below(&self.root.join("keys"))? {
-            if let Some(record) = fs::read(&path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok()) {
-                records.push((path, record));
-            }
-        }
-        Ok(records)
-    }
-
     /// Counts what is here.
     ///
     /// # Errors
@@ -232,11 +228,14 @@ impl Store {
     pub fn summary(&self) -> Result<StoreSummary> {
         let mut summary = StoreSummary::default();
         let mut used = BTreeSet::new();
-        for (_, record) in self.records()? {
+        for record in self.records.all()?.into_iter().flat_map(|(_, records)| records) {
+            match record.content() {
+                Some(content) => summary.bytes += content.len() as u64,
+                None => drop(used.insert(record.output.to_string())),
+            }
             let entry = summary.kinds.entry(record.fingerprint.kind).or_default();
             entry.0 += 1;
             entry.1 += record.bytes;
-            used.insert(record.output.to_string());
         }
         for folder in ["objects", "keys", "runs"] {
             summary.unfinished += temporary_files_below(&self.root.join(folder))?.len();
@@ -249,7 +248,7 @@ impl Store {
         Ok(summary)
     }
 
-    /// Hashes every object; removes damaged ones and returns their names.
+    /// Hashes every output, in objects and in records; removes damaged ones and returns their names.
     ///
     /// # Errors
     /// When the folders cannot be listed.
@@ -263,6 +262,7 @@ impl Store {
                 damaged.push(name);
             }
         }
+        damaged.append(&mut self.records.remove_damaged()?);
         Ok(damaged)
     }
 
@@ -282,16 +282,27 @@ impl Store {
         for run in self.runs()?.into_values() {
             live.extend(run.jobs.into_values().chain(run.unfinished.into_values()));
         }
-        let mut used = BTreeSet::new();
-        for (path, record) in self.records()? {
-            let young = fs::metadata(&path).is_ok_and(|metadata| age(&metadata) < min_age);
-            if young || live.contains(&record.fingerprint.key()) {
-                used.insert(record.output.to_string());
-            } else {
-                remove(&path)?;
+        let (mut used, mut kept, mut removed) = (BTreeSet::new(), Vec::new(), Removed::default());
+        let mut unwanted: BTreeMap<PathBuf, BTreeSet<ContentHash>> = BTreeMap::new();
+        for (file, records) in self.records.all()? {
+            let Ok(metadata) = fs::metadata(&file) else { continue };
+            let young = age(&metadata) < min_age;
+            for record in records {
+                let wanted = young || live.contains(&record.key());
+                match (record.content(), wanted) {
+                    (Some(_), true) => {
+                        let place = Kept::Record(file.clone(), record.key());
+                        kept.push((metadata.modified()?, record.bytes, place));
+                    }
+                    (Some(_), false) => removed.count(record.bytes),
+                    (None, true) => drop(used.insert(record.output.to_string())),
+                    (None, false) => {}
+                }
+                if !wanted {
+                    unwanted.entry(file.clone()).or_default().insert(record.key());
+                }
             }
         }
-        let mut removed = Removed::default();
         for folder in ["objects", "keys", "runs"] {
             for path in temporary_files_below(&self.root.join(folder))? {
                 let Ok(metadata) = fs::metadata(&path) else { continue };
@@ -301,29 +312,41 @@ impl Store {
                 }
             }
         }
-        let mut kept = Vec::new();
         for path in files_below(&self.root.join("objects"))? {
             let Ok(metadata) = fs::metadata(&path) else { continue };
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
             if used.contains(name) || age(&metadata) < min_age {
-                kept.push((metadata.modified()?, path, metadata.len()));
+                kept.push((metadata.modified()?, metadata.len(), Kept::Object(path)));
             } else {
                 remove(&path)?;
                 removed.count(metadata.len());
             }
         }
         kept.sort();
-        let mut size: u64 = kept.iter().map(|(_, _, length)| length).sum();
-        for (_, path, length) in &kept {
+        let mut size: u64 = kept.iter().map(|(_, bytes, _)| bytes).sum();
+        for (_, bytes, place) in kept {
             if max_bytes.is_none_or(|limit| size <= limit) {
                 break;
             }
-            remove(path)?;
-            removed.count(*length);
-            size -= length;
+            match place {
+                Kept::Object(path) => remove(&path)?,
+                Kept::Record(file, key) => drop(unwanted.entry(file).or_default().insert(key)),
+            }
+            removed.count(bytes);
+            size -= bytes;
         }
+        self.records.remove(&unwanted)?;
         Ok(removed)
     }
+}
+
+/// Where an output is.
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Kept {
+    /// In this object.
+    Object(PathBuf),
+    /// In the record of this key in this file.
+    Record(PathBuf, ContentHash),
 }
 
 /// What is younger may be in the hands of another process.
@@ -498,6 +521,9 @@ mod tests {
 
     use super::*;
 
+    /// Too long for a record.
+    const LARGE: [u8; 9999] = [7; 9999];
+
     fn fingerprint(version: u32) -> Fingerprint {
         Fingerprint {
             kind: "test".to_owned(),
@@ -514,44 +540,59 @@ mod tests {
         assert!(store.lookup(fingerprint(1).key()).is_none());
         let hash = store.write(&fingerprint(1), b"content", 0.5).unwrap();
         assert_eq!(store.lookup(fingerprint(1).key()).unwrap().output, hash);
-        assert_eq!(store.read(hash).unwrap(), b"content");
+        assert_eq!(store.read(fingerprint(1).key(), hash).unwrap(), b"content");
+        let object = store.write(&fingerprint(2), &LARGE, 0.5).unwrap();
+        assert_eq!(store.read(fingerprint(2).key(), object).unwrap(), LARGE);
+        assert_eq!(files_below(&folder.path().join("objects")).unwrap(), [store.object_path(object)]);
+        let summary = store.summary().unwrap();
+        assert_eq!((summary.bytes, summary.orphans), (LARGE.len() as u64 + 7, 0));
     }
 
     #[test]
     fn damage_is_noticed_on_reading_and_by_verify() {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).unwrap();
-        let hash = store.write(&fingerprint(1), b"content", 0.0).unwrap();
-        fs::write(store.object_path(hash), b"c0ntent").unwrap();
-        assert!(store.read(hash).unwrap_err().to_string().contains("damaged"));
+        let key = fingerprint(1).key();
+        let hash = store.write(&fingerprint(1), &LARGE, 0.0).unwrap();
+        let mut damaged = LARGE;
+        damaged[9] = 8;
+        fs::write(store.object_path(hash), damaged).unwrap();
+        assert!(store.read(key, hash).unwrap_err().to_string().contains("damaged"));
         assert_eq!(store.verify().unwrap(), [hash.to_string()]);
-        assert!(store.lookup(fingerprint(1).key()).is_none());
+        assert!(store.lookup(key).is_none() && store.verify().unwrap().is_empty());
     }
 
     #[test]
     fn garbage_is_what_no_run_uses() {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).unwrap();
-        let kept = store.write(&fingerprint(1), b"used", 0.0).unwrap();
-        let lost = store.write(&fingerprint(2), b"unused", 0.0).unwrap();
+        store.write(&fingerprint(1), b"used", 0.0).unwrap();
+        store.write(&fingerprint(2), b"unused", 0.0).unwrap();
+        let (kept, lost) = (fingerprint(1).key(), fingerprint(2).key());
         let jobs = BTreeMap::from([("job".to_owned(), fingerprint(1).key())]);
         store.remember_run("scene", jobs, LastRun::default()).unwrap();
         let collect = |max| store.collect_garbage(max, Duration::ZERO).unwrap();
         assert_eq!(collect(None), Removed { files: 1, bytes: 6 });
-        assert!(store.read(kept).is_ok() && store.read(lost).is_err());
+        assert!(store.lookup(kept).is_some() && store.lookup(lost).is_none());
         assert_eq!(collect(Some(0)), Removed { files: 1, bytes: 4 });
+        assert!(store.lookup(kept).is_none());
+        store.write(&fingerprint(1), &LARGE, 0.0).unwrap();
+        store.write(&fingerprint(2), &[&LARGE[..], b"unused"].concat(), 0.0).unwrap();
+        assert_eq!(collect(None), Removed { files: 1, bytes: LARGE.len() as u64 + 6 });
+        assert!(store.lookup(kept).is_some() && store.lookup(lost).is_none());
+        assert_eq!(collect(Some(0)), Removed { files: 1, bytes: LARGE.len() as u64 });
     }
 
     #[test]
     fn garbage_collection_spares_what_is_young_or_of_a_stopped_run() {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).unwrap();
-        let hash = store.write(&fingerprint(1), b"of a stopped run", 0.0).unwrap();
+        store.write(&fingerprint(1), b"of a stopped run", 0.0).unwrap();
         store.note_unfinished("scene", BTreeMap::from([("job".to_owned(), fingerprint(1).key())])).unwrap();
         store.write(&fingerprint(2), b"of a run that goes on", 0.0).unwrap();
         assert_eq!(store.collect_garbage(None, Duration::from_hours(1)).unwrap(), Removed::default());
         assert_eq!(store.collect_garbage(None, Duration::ZERO).unwrap(), Removed { files: 1, bytes: 21 });
-        assert!(store.read(hash).is_ok());
+        assert!(store.lookup(fingerprint(1).key()).is_some());
     }
 
     #[test]
@@ -559,8 +600,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).unwrap();
         store.write(&fingerprint(1), b"content", 0.0).unwrap();
-        let shard = entries(&folder.path().join("objects")).unwrap().remove(0);
-        fs::write(shard.join(".writing-abc"), b"half").unwrap();
+        fs::write(folder.path().join("keys/.writing-abc"), b"half").unwrap();
         assert_eq!(store.summary().unwrap().unfinished, 1);
         store.collect_garbage(None, Duration::ZERO).unwrap();
         assert_eq!(store.summary().unwrap().unfinished, 0);

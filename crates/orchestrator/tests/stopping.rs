@@ -60,11 +60,19 @@ fn exports_that_a_killed_run_left_old_are_written_again() {
     assert_eq!(std::fs::read(&poses).unwrap(), new);
 }
 
-/// Names of the store's objects: the hashes of their contents.
-fn objects(folder: &Path) -> BTreeSet<String> {
+/// Hashes of all results in the store: the names of its objects, and those in its records.
+fn results(folder: &Path) -> BTreeSet<String> {
     let objects = files_below(&folder.join(".setloc-cache/objects"));
     let names = objects.iter().map(|path| path.file_name().unwrap().to_string_lossy().into_owned());
-    names.filter(|name| !name.starts_with('.')).collect()
+    let mut results: BTreeSet<String> = names.filter(|name| !name.starts_with('.')).collect();
+    for path in files_below(&folder.join(".setloc-cache/keys")) {
+        if path.extension().is_some_and(|ending| ending == "jsonl") {
+            let text = std::fs::read_to_string(path).unwrap();
+            let records = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
+            results.extend(records.map(|record| record["output"].as_str().unwrap().to_owned()));
+        }
+    }
+    results
 }
 
 #[test]
@@ -133,7 +141,7 @@ fn kill_9_at_any_moment_loses_no_finished_job_and_changes_no_byte() {
         finished.extend(logged(&log, "finished"));
         let distinct: BTreeSet<&String> = finished.iter().collect();
         assert_eq!(distinct.len(), finished.len(), "trial {trial}: a finished job was done again");
-        assert_eq!(objects(folder.path()), objects(undisturbed.path()), "trial {trial}");
+        assert_eq!(results(folder.path()), results(undisturbed.path()), "trial {trial}");
         let (own, expected) = (outputs(folder.path()), outputs(undisturbed.path()));
         let differ: Vec<&PathBuf> =
             own.keys().chain(expected.keys()).filter(|path| own.get(*path) != expected.get(*path)).collect();

@@ -9,7 +9,6 @@ use setloc_sfm::Reconstruction;
 use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
 use crate::building::{BuildOutcome, Built, build_scene};
-use crate::codec;
 use crate::dataset::{ImageFolder, SkippedImage, list_images};
 use crate::error::Hinted;
 use crate::export::{Marker, ply, scene_json, top_view_png, write_colmap};
@@ -46,8 +45,8 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
             (run, skipped)
         }
         BuildOutcome::Built(built) => {
-            let write_scene = || write_atomically(output, &codec::encode(&*built.scene)?);
-            let (scene, models) = rayon::join(write_scene, || write_models(&export, built));
+            let (scene, models) =
+                rayon::join(|| write_atomically(output, &built.file), || write_models(&export, built));
             scene.and(models)?;
             write_report(&export, built, &session)?;
             summarize(&built.scene, folder.images.len() + folder.skipped.len());

@@ -33,7 +33,10 @@ pub fn write_colmap(
             points_of_image[observation.image.index()].push((observation.feature, at + 1));
         }
     }
-    points_of_image.par_iter_mut().for_each(|points| points.sort_unstable());
+    points_of_image.par_iter_mut().for_each(|points| {
+        points.sort_unstable();
+        points.dedup_by_key(|(feature, _)| *feature);
+    });
     let point = |(at, point): (usize, &ReconstructionPoint)| -> Result<String, std::fmt::Error> {
         let (p, [r, g, b]) = (point.position, point.color);
         let mut line = String::new();
@@ -52,13 +55,21 @@ pub fn write_colmap(
         let ids = format!("{} {}", image.camera.0 + 1, image.name);
         writeln!(lines, "{} {} {} {} {} {} {} {} {ids}", at + 1, q.w, q.i, q.j, q.k, t.x, t.y, t.z)?;
         let keypoints = features.get(at).copied().flatten().map_or(&[][..], |features| &features.keypoints);
+        // Nearly all of the export: millions of numbers.
+        let mut number = zmij::Buffer::new();
+        let mut points = points_of_image[at].iter().peekable();
         for (index, keypoint) in keypoints.iter().enumerate() {
-            write!(lines, "{}{} {} ", if index > 0 { " " } else { "" }, keypoint.x, keypoint.y)?;
-            let points = &points_of_image[at];
-            match points.binary_search_by_key(&(index as u32), |(feature, _)| *feature) {
-                Ok(found) => write!(lines, "{}", points[found].1)?,
-                Err(_) => lines.push_str("-1"),
+            for coordinate in [keypoint.x, keypoint.y] {
+                lines.push_str(number.format(coordinate));
+                lines.push(' ');
             }
+            match points.next_if(|(feature, _)| *feature as usize == index) {
+                Some((_, id)) => write!(lines, "{id} ")?,
+                None => lines.push_str("-1 "),
+            }
+        }
+        if !keypoints.is_empty() {
+            lines.pop();
         }
         lines.push('\n');
         Ok(lines)

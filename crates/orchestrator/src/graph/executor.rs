@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 
@@ -15,7 +15,7 @@ use crate::clock;
 use crate::codec::{self, Artifact};
 use crate::error::Interrupted;
 use crate::fingerprint::{ContentHash, Fingerprint};
-use crate::store::Store;
+use crate::store::{Output, Store};
 
 /// How to run.
 pub struct RunOptions<'a> {
@@ -93,6 +93,16 @@ struct Shared {
 /// Results that may wait to be kept; further ones hold up the jobs that made them.
 const MOST_WAITING: usize = 16;
 
+/// Threads that keep results. They wait for the disk most of the time, and file systems sync several files at once for
+/// the price of one.
+const KEEPERS: usize = 4;
+
+/// How long a small result waits for others that are kept with it: what a kill may cost, against a file for each.
+const GATHERING: Duration = Duration::from_millis(100);
+
+/// Bytes of results that wait for no others.
+const ENOUGH_BYTES: usize = 1 << 18;
+
 /// The result of a job on its way to the store.
 struct Unkept {
     id: JobId,
@@ -102,6 +112,27 @@ struct Unkept {
     started_secs: f64,
     wall_secs: f64,
     cpu_secs: f64,
+}
+
+impl Unkept {
+    fn as_output(&self) -> Output<'_> {
+        let Self { fingerprint, output, file, cpu_secs, .. } = self;
+        Output { fingerprint, hash: *output, file, cpu_secs: *cpu_secs }
+    }
+}
+
+/// The next results to be kept at once: small ones that come soon after each other; none when no more will come.
+fn next_together(unkept: &Receiver<Unkept>) -> Vec<Unkept> {
+    let Ok(first) = unkept.recv() else { return Vec::new() };
+    let until = Instant::now() + GATHERING;
+    let (mut bytes, mut together) = (first.file.len(), vec![first]);
+    while bytes < ENOUGH_BYTES
+        && let Ok(next) = unkept.recv_timeout(until.saturating_duration_since(Instant::now()))
+    {
+        bytes += next.file.len();
+        together.push(next);
+    }
+    together
 }
 
 /// A graph being run.
@@ -157,7 +188,7 @@ impl<'a> Executor<'a> {
         let (keep, unkept) = sync_channel(MOST_WAITING);
         let unkept = Mutex::new(unkept);
         std::thread::scope(|threads| {
-            for _ in 0..self.options.threads.max(1) {
+            for _ in 0..KEEPERS {
                 threads.spawn(|| self.keep_results(&unkept));
             }
             rayon::scope(|scope| self.pump(scope, &keep));
@@ -285,29 +316,38 @@ impl<'a> Executor<'a> {
 
     /// Stores results until no job is left that could send one.
     fn keep_results(&self, unkept: &Mutex<Receiver<Unkept>>) {
-        let next = || unkept.lock().unwrap_or_else(PoisonError::into_inner).recv();
-        while let Ok(Unkept { id, fingerprint, output, file, started_secs, wall_secs, cpu_secs }) = next() {
-            let (job, bytes) = (self.graph.job(id), file.len() as u64);
-            match self.options.store.keep(&fingerprint, output, &file, cpu_secs) {
-                Ok(()) => self.options.observer.notice(&Event::Finished {
-                    kind: job.kind,
-                    job: job.name.clone(),
-                    started_secs,
-                    wall_secs,
-                    cpu_secs,
-                    bytes,
-                }),
+        loop {
+            let together = next_together(&unkept.lock().unwrap_or_else(PoisonError::into_inner));
+            if together.is_empty() {
+                return;
+            }
+            let outputs: Vec<Output<'_>> = together.iter().map(Unkept::as_output).collect();
+            match self.options.store.keep(&outputs) {
+                Ok(()) => together.iter().for_each(|made| self.finished(made)),
                 Err(error) => {
-                    let reported = anyhow::anyhow!("{error:#}");
-                    let reason = format!("cannot keep the result of {}", job.label());
-                    let state = self.failed(id, &reported.context(reason));
-                    let mut shared = self.lock();
-                    shared.fatal.get_or_insert(error);
-                    let slot = &mut shared.slots[id.index()];
-                    (slot.state, slot.output) = (state, None);
+                    for Unkept { id, .. } in &together {
+                        let reason = format!("cannot keep the result of {}", self.graph.job(*id).label());
+                        let state = self.failed(*id, &anyhow::anyhow!("{error:#}").context(reason));
+                        let slot = &mut self.lock().slots[id.index()];
+                        (slot.state, slot.output) = (state, None);
+                    }
+                    self.lock().fatal.get_or_insert(error);
                 }
             }
         }
+    }
+
+    /// Says that a job's result is kept.
+    fn finished(&self, made: &Unkept) {
+        let job = self.graph.job(made.id);
+        self.options.observer.notice(&Event::Finished {
+            kind: job.kind,
+            job: job.name.clone(),
+            started_secs: made.started_secs,
+            wall_secs: made.wall_secs,
+            cpu_secs: made.cpu_secs,
+            bytes: made.file.len() as u64,
+        });
     }
 
     /// What the job's result depends on; all its inputs must be decided.
@@ -342,7 +382,8 @@ impl<'a> Executor<'a> {
         let Product { value, file } = product?;
         let output = ContentHash::of(&file);
         let slot = &mut self.lock().slots[id.index()];
-        if slot.users_left > 0 {
+        // What no job uses is what the graph was run for.
+        if slot.users_left > 0 || self.graph.users(id).next().is_none() {
             slot.value = Some(value);
         }
         Ok(Unkept { id, fingerprint, output, file, started_secs, wall_secs, cpu_secs })
@@ -364,20 +405,33 @@ impl<'a> Executor<'a> {
     /// When there is none, or it can neither be read nor made again.
     pub fn load<T: Artifact>(&self, id: JobId) -> Result<Arc<T>> {
         let label = self.graph.job(id).label();
-        let (value, output) = {
-            let shared = self.lock();
-            (shared.slots[id.index()].value.clone(), shared.slots[id.index()].output)
+        let (value, key, output) = {
+            let slot = &self.lock().slots[id.index()];
+            (slot.value.clone(), slot.key, slot.output)
         };
         let value = if let Some(value) = value {
             value
         } else {
-            let output = output.with_context(|| format!("{label} has no result"))?;
-            match self.options.store.read(output).and_then(|file| Ok(codec::decode::<T>(&file)?)) {
+            let (key, output) = key.zip(output).with_context(|| format!("{label} has no result"))?;
+            match self.options.store.read(key, output).and_then(|file| Ok(codec::decode::<T>(&file)?)) {
                 Ok(value) => self.keep(id, Arc::new(value)),
                 Err(error) => self.remake(id, output, &error)?,
             }
         };
         value.downcast::<T>().map_err(|_| anyhow::anyhow!("the result of {label} is no {}", T::KIND))
+    }
+
+    /// The file of a job's result.
+    ///
+    /// # Errors
+    /// As [`Executor::load`].
+    pub fn file<T: Artifact>(&self, id: JobId) -> Result<Vec<u8>> {
+        let (key, output) = {
+            let slot = &self.lock().slots[id.index()];
+            (slot.key, slot.output)
+        };
+        let stored = key.zip(output).and_then(|(key, output)| self.options.store.read(key, output).ok());
+        stored.map_or_else(|| Ok(codec::encode(&*self.load::<T>(id)?)?), Ok)
     }
 
     fn keep(&self, id: JobId, value: Arc<dyn Any + Send + Sync>) -> Arc<dyn Any + Send + Sync> {
@@ -464,7 +518,7 @@ mod tests {
         let hold = |memory: usize| {
             let now = used.fetch_add(memory, Ordering::SeqCst) + memory;
             most.fetch_max(now, Ordering::SeqCst);
-            std::thread::sleep(std::time::Duration::from_millis(5));
+            std::thread::sleep(Duration::from_millis(5));
             used.fetch_sub(memory, Ordering::SeqCst);
             Product::new(Number(0))
         };
