@@ -56,9 +56,9 @@ pub enum LinearSolver {
     /// Up to 500 free poses that is always Cholesky.
     #[default]
     Auto,
-    /// By Cholesky of S, dense or sparse.
+    /// By Cholesky of S, dense or sparse, unless that takes more than 32 GiB.
     Direct,
-    /// By preconditioned conjugate gradients; S is never formed, and steps are as exact as they need to be.
+    /// By preconditioned conjugate gradients to a relative residual of 0.1; S is never formed.
     Iterative,
 }
 

@@ -35,8 +35,8 @@ pub(super) struct Budget {
 }
 
 impl Budget {
-    /// No limit.
-    const ANY: Self = Self { values: usize::MAX, operations: f64::INFINITY };
+    /// Whatever it takes: as much as offsets of 32 bits reach, 32 GiB.
+    const ANY: Self = Self { values: u32::MAX as usize, operations: f64::INFINITY };
     /// What fits into memory, however long it takes.
     pub const MEMORY: Self = Self { values: MAX_VALUES, ..Self::ANY };
 
@@ -57,7 +57,8 @@ impl Budget {
 
     /// Whether a pattern may be within the budget; when not, no ordering of it is.
     ///
-    /// A factor has at least the values of S, and squared over the columns they add up to at least their mean's square.
+    /// A factor has at least the values of S (the upper halves of diagonal blocks, counted here, are few), and their
+    /// numbers in the columns, squared, add up to at least what equal columns would.
     pub fn may_suffice(&self, pattern: &BlockPattern) -> bool {
         let values = pattern.len() as f64;
         pattern.len() <= self.values && values * values <= self.operations * pattern.size() as f64

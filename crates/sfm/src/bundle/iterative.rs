@@ -133,6 +133,7 @@ impl IterativeSystem {
         let mut iterations = 0;
         while rho > sought && iterations < MAX_ITERATIONS {
             iterations += 1;
+            self.iterations += 1;
             multiply(direction, product);
             let curvature = dot(direction, product);
             let length = rho / curvature;
@@ -149,7 +150,6 @@ impl IterativeSystem {
             }
             rho = next;
         }
-        self.iterations += u64::from(iterations);
         self.truncated += u32::from(rho > sought);
         rho.is_finite()
     }

@@ -478,6 +478,7 @@ impl<const D: usize> NormalEquations<D> {
             }
         }
         for_each_chunk(chunks, |chunk| chunk.substitute(lambda, step, points, couplings, pattern));
+        // What the model decreases by also holds for conjugate gradients: what they leave is perpendicular to their step.
         let mut sums = StepSums::default();
         for ((step, gradient), damping) in self.step.iter().zip(&self.gradient).zip(&self.damping) {
             sums.predicted += 0.5 * step * (damping * step - gradient);
