@@ -7,7 +7,8 @@
 //! its place of the image.
 //!
 //! Levenberg–Marquardt with analytic Jacobians; points are eliminated (Schur complement) and the reduced camera system
-//! is factorized by Cholesky, dense or sparse. Robust losses act by first-order reweighting (ρ′ on residual and
+//! is factorized by Cholesky, dense or sparse, or, when it does not fit, solved by conjugate gradients without being
+//! formed ([`LinearSolver`]). Robust losses act by first-order reweighting (ρ′ on residual and
 //! Jacobian; the second-order term of Triggs' correction is left out, as it makes the model indefinite).
 //!
 //! Tangents: a pose is perturbed as R ← R·Exp(ω), t ← t + δ with (R, t) = `world_from_camera`: ω in the camera frame,
@@ -20,6 +21,8 @@
 
 pub mod bal;
 mod camera_system;
+mod elimination;
+mod iterative;
 mod levenberg_marquardt;
 mod loss;
 mod normal_equations;
@@ -31,6 +34,7 @@ mod spherical;
 use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
 
+use camera_system::Budget;
 use levenberg_marquardt::{Limits, Outcome, minimize};
 use normal_equations::NormalEquations;
 use spherical::{Layout, POSE_DIM, Spherical};
@@ -44,6 +48,20 @@ pub use problem::{
 /// S counts as singular when it has an eigenvalue below this, relative to the diagonal of JᵀJ.
 const SINGULAR_SHARE: f64 = 1e-13;
 
+/// How the reduced camera system S of each step is solved.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LinearSolver {
+    /// By Cholesky while S and its factor take at most 2 GiB and about the time of conjugate gradients, else by these.
+    /// Up to 500 free poses that is always Cholesky.
+    #[default]
+    Auto,
+    /// By Cholesky of S, dense or sparse, unless that takes more than 32 GiB.
+    Direct,
+    /// By preconditioned conjugate gradients to a relative residual of 0.1; S is never formed.
+    Iterative,
+}
+
 /// How to minimize.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -56,6 +74,8 @@ pub struct BundleParams {
     pub function_tolerance: f64,
     /// Ends when a step is shorter than this share of the parameters' norm.
     pub parameter_tolerance: f64,
+    /// How the reduced camera system of each step is solved.
+    pub linear_solver: LinearSolver,
 }
 
 impl Default for BundleParams {
@@ -65,6 +85,7 @@ impl Default for BundleParams {
             max_iterations: 50,
             function_tolerance: 1e-6,
             parameter_tolerance: 1e-10,
+            linear_solver: LinearSolver::Auto,
         }
     }
 }
@@ -80,6 +101,11 @@ pub struct BundleReport {
     pub iterations: u32,
     /// Steps that decreased the cost.
     pub accepted_steps: u32,
+    /// Iterations of conjugate gradients over all steps; none with a factorization.
+    pub linear_iterations: u64,
+    /// Steps whose conjugate gradients met their limit before the accuracy sought. When the last ones did, what bends a
+    /// long chain of cameras may be left unsolved: it hardly shows in the cost.
+    pub truncated_steps: u32,
     /// Why it ended.
     pub termination: Termination,
     /// Observations used.
@@ -97,6 +123,8 @@ impl BundleReport {
             final_cost: outcome.final_cost,
             iterations: outcome.iterations,
             accepted_steps: outcome.accepted,
+            linear_iterations: outcome.linear_iterations,
+            truncated_steps: outcome.truncated_steps,
             termination: outcome.termination,
             observations,
             ignored,
@@ -112,10 +140,10 @@ impl BundleReport {
 pub fn solve(params: &BundleParams, problem: &mut BundleProblem) -> BundleReport {
     let loss = if params.loss.is_valid() { params.loss } else { RobustLoss::Trivial };
     let (mut model, layout) = Spherical::new(problem, loss);
-    let Layout { links, points, free, point_of_index, extra_dims, ignored, priors } = layout;
-    let observations = links.len();
-    let mut equations =
-        NormalEquations::<POSE_DIM>::new(links, points, free, model.block_count(), &extra_dims);
+    let Layout { structure, point_of_index, ignored, priors } = layout;
+    let observations = structure.links.len();
+    let budget = Budget::new(params.linear_solver, observations);
+    let mut equations = NormalEquations::<POSE_DIM>::new(structure, &budget);
     let unknowns = equations.unknowns();
     let degrees_of_freedom = (2 * observations + 3 * priors) as i64 - unknowns as i64;
     let outcome = if unknowns == 0 {
@@ -142,8 +170,9 @@ pub fn solve(params: &BundleParams, problem: &mut BundleProblem) -> BundleReport
 /// translation in the world frame in its unit squared). A fixed pose has covariance zero. With a robust loss,
 /// observations count by their weight ρ′.
 ///
-/// `None` when a pose asked for does not exist or has no observation, or when the problem leaves the gauge or anything
-/// else on the camera side undetermined.
+/// `None` when a pose asked for does not exist or has no observation, when the problem leaves the gauge or anything else
+/// on the camera side undetermined, or when S and its factor take more than 2 GiB: conjugate gradients could give a
+/// block, but not tell that it exists.
 pub fn covariance(problem: &BundleProblem, loss: RobustLoss, poses: &[u32]) -> Option<Vec<Matrix6<f64>>> {
     let (model, layout) = Spherical::new(problem, loss);
     let blocks = poses
@@ -156,9 +185,7 @@ pub fn covariance(problem: &BundleProblem, loss: RobustLoss, poses: &[u32]) -> O
     if blocks.iter().all(Option::is_none) {
         return Some(vec![Matrix6::zeros(); poses.len()]);
     }
-    let Layout { links, points, free, extra_dims, .. } = layout;
-    let mut equations =
-        NormalEquations::<POSE_DIM>::new(links, points, free, model.block_count(), &extra_dims);
+    let mut equations = NormalEquations::<POSE_DIM>::new(layout.structure, &Budget::MEMORY);
     let cost = equations.linearize(&model);
     if !cost.is_finite() || !equations.is_definite_by(SINGULAR_SHARE) || !equations.factorize(0.0) {
         return None;
@@ -169,7 +196,9 @@ pub fn covariance(problem: &BundleProblem, loss: RobustLoss, poses: &[u32]) -> O
         for k in 0..POSE_DIM {
             column.fill(0.0);
             column[block * POSE_DIM + k] = 1.0;
-            equations.solve_camera_side(&mut column);
+            if !equations.solve_camera_side(&mut column) {
+                return None;
+            }
             for row in 0..POSE_DIM {
                 result[(row, k)] = column[block * POSE_DIM + row];
             }

@@ -8,8 +8,9 @@ use std::str::FromStr;
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
+use super::camera_system::Budget;
 use super::levenberg_marquardt::{Limits, minimize};
-use super::normal_equations::{BlockTerm, Linearized, Link, Model, NormalEquations};
+use super::normal_equations::{BlockTerm, Linearized, Link, Model, NormalEquations, Structure};
 use super::{BundleParams, BundleReport, RobustLoss};
 
 /// Scalars of a camera: rotation (left perturbation), translation, f, k₁, k₂.
@@ -250,11 +251,13 @@ impl BalProblem {
             links.push(Link { point: points.len() as u32 - 1, block: observation.camera, extra: u32::MAX });
         }
         let count = links.len();
-        let free = vec![true; points.len()];
         let loss = if params.loss.is_valid() { params.loss } else { RobustLoss::Trivial };
         let mut model =
             BalModel { loss, cameras: self.cameras.clone(), candidates: self.cameras.clone(), observations };
-        let mut equations = NormalEquations::<CAMERA_DIM>::new(links, points, free, self.cameras.len(), &[]);
+        let (free, block_count) = (vec![true; points.len()], self.cameras.len());
+        let structure = Structure { links, points, free, block_count, extra_dims: Vec::new() };
+        let mut equations =
+            NormalEquations::<CAMERA_DIM>::new(structure, &Budget::new(params.linear_solver, count));
         let limits = Limits::from(params);
         let outcome = minimize(&mut model, &mut equations, &limits);
         self.cameras = model.cameras;

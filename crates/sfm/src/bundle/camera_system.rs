@@ -3,17 +3,67 @@
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::{factor, solve};
 use faer::sparse::linalg::cholesky::{
-    CholeskySymbolicParams, LltRef, SymbolicCholesky, SymmetricOrdering, factorize_symbolic_cholesky,
+    CholeskySymbolicParams, LltRef, SymbolicCholesky, SymbolicCholeskyRaw, SymmetricOrdering,
+    factorize_symbolic_cholesky,
 };
 use faer::sparse::{SparseColMatRef, SymbolicSparseColMatRef};
 use faer::{Conj, Mat, MatMut, Par, Side};
 
+use super::LinearSolver;
 use super::pattern::BlockPattern;
 
 /// Up to this scalar size the dense factorization wins whatever the fill.
 const DENSE_SIZE: usize = 600;
 /// Share of the lower triangle above which the dense factorization wins at any size.
 const DENSE_FILL: f64 = 0.4;
+
+/// Numbers that S, the chunks' shares in it and its factorization may take: 2 GiB.
+const MAX_VALUES: usize = 1 << 28;
+/// Operations of a factorization that are never too many, about a quarter of a second: S of 500 cameras, full.
+const MIN_OPERATIONS: f64 = 1e10;
+/// Operations of a factorization, per observation, that take as long as a step by conjugate gradients. Measured on towns
+/// of 600 to 3000 panoramas: Cholesky is 3 times as fast at 2·10³, as fast at 3·10⁴, 4 times as slow at 8·10⁴.
+const OPERATIONS_PER_OBSERVATION: f64 = 3e4;
+
+/// What a factorization may cost.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Budget {
+    /// Most numbers stored.
+    values: usize,
+    /// Most multiplications and additions of one factorization.
+    operations: f64,
+}
+
+impl Budget {
+    /// Whatever it takes: as much as offsets of 32 bits reach, 32 GiB.
+    const ANY: Self = Self { values: u32::MAX as usize, operations: f64::INFINITY };
+    /// What fits into memory, however long it takes.
+    pub const MEMORY: Self = Self { values: MAX_VALUES, ..Self::ANY };
+
+    /// What a solver spends on a problem of so many observations before it leaves S implicit.
+    pub fn new(solver: LinearSolver, observations: usize) -> Self {
+        let operations = MIN_OPERATIONS.max(OPERATIONS_PER_OBSERVATION * observations as f64);
+        match solver {
+            LinearSolver::Auto => Self { operations, ..Self::MEMORY },
+            LinearSolver::Direct => Self::ANY,
+            LinearSolver::Iterative => Self { values: 0, operations: 0.0 },
+        }
+    }
+
+    /// What is left when so many numbers are stored elsewhere.
+    pub fn without(&self, values: usize) -> Option<Self> {
+        Some(Self { values: self.values.checked_sub(values)?, ..*self })
+    }
+
+    /// Whether a pattern may be within the budget; when not, no ordering of it is.
+    ///
+    /// A factor has at least the values of S (the upper halves of diagonal blocks, counted here, are few), and their
+    /// numbers in the columns, squared, add up to at least what equal columns would.
+    pub fn may_suffice(&self, pattern: &BlockPattern) -> bool {
+        let values = pattern.len() as f64;
+        pattern.len() <= self.values && values * values <= self.operations * pattern.size() as f64
+    }
+}
 
 #[expect(clippy::large_enum_variant, reason = "one per problem, never moved in a loop")]
 /// A factorization whose memory and symbolic analysis are reused over all iterations.
@@ -32,17 +82,16 @@ pub(super) enum CameraSystem {
 }
 
 impl CameraSystem {
-    /// Chooses the factorization and allocates for it.
-    pub fn new(pattern: &BlockPattern) -> Self {
+    /// Chooses the factorization and allocates for it; `None` when it is beyond the budget.
+    pub fn new(pattern: &BlockPattern, budget: &Budget) -> Option<Self> {
         let size = pattern.size();
         let fill = pattern.len() as f64 / (0.5 * (size * size) as f64).max(1.0);
-        if size > DENSE_SIZE
-            && fill < DENSE_FILL
-            && let Some(sparse) = Self::sparse(pattern)
-        {
-            return sparse;
+        if size > DENSE_SIZE && fill < DENSE_FILL {
+            return Self::sparse(pattern, budget);
         }
-        Self::dense(size)
+        let operations = (size as f64).powi(3) / 3.0;
+        let fits = size.checked_mul(size)? <= budget.values && operations <= budget.operations;
+        fits.then(|| Self::dense(size))
     }
 
     fn dense(size: usize) -> Self {
@@ -51,7 +100,11 @@ impl CameraSystem {
         Self::Dense { matrix: Mat::zeros(size, size), memory: MemBuffer::new(scratch) }
     }
 
-    fn sparse(pattern: &BlockPattern) -> Option<Self> {
+    fn sparse(pattern: &BlockPattern, budget: &Budget) -> Option<Self> {
+        // Row indices and values.
+        if 2 * pattern.len() > budget.values {
+            return None;
+        }
         let (mut column_starts, mut rows) = (vec![0], Vec::with_capacity(pattern.len()));
         for block_column in 0..pattern.block_count() {
             for column in 0..pattern.dim(block_column) {
@@ -71,6 +124,10 @@ impl CameraSystem {
             CholeskySymbolicParams::default(),
         )
         .ok()?;
+        let values = 2 * rows.len() + symbolic.len_val();
+        if values > budget.values || operations(&symbolic) > budget.operations {
+            return None;
+        }
         let scratch = symbolic
             .factorize_numeric_llt_scratch::<f64>(Par::Seq, faer::Spec::default())
             .or(symbolic.solve_in_place_scratch::<f64>(1, Par::Seq));
@@ -166,6 +223,23 @@ impl CameraSystem {
     }
 }
 
+/// Multiplications and additions of a numeric factorization: Σ (values in a column of the factor)².
+fn operations(symbolic: &SymbolicCholesky<usize>) -> f64 {
+    let squares = |columns: usize, below: usize| -> f64 {
+        (below + 1..=below + columns).map(|length| (length as f64).powi(2)).sum()
+    };
+    match symbolic.raw() {
+        SymbolicCholeskyRaw::Simplicial(simplicial) => {
+            simplicial.col_ptr().windows(2).map(|ends| squares(1, ends[1] - ends[0] - 1)).sum()
+        }
+        SymbolicCholeskyRaw::Supernodal(supernodal) => {
+            let columns = supernodal.supernode_begin().iter().zip(supernodal.supernode_end());
+            let below = supernodal.col_ptr_for_row_idx().windows(2);
+            columns.zip(below).map(|((begin, end), below)| squares(end - begin, below[1] - below[0])).sum()
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -201,7 +275,7 @@ mod tests {
     #[test]
     fn dense_and_sparse_solve_the_system_twice() {
         let (pattern, blocks, full) = example(40);
-        let sparse = CameraSystem::sparse(&pattern).unwrap();
+        let sparse = CameraSystem::sparse(&pattern, &Budget::ANY).unwrap();
         for mut system in [sparse, CameraSystem::dense(pattern.size())] {
             for round in 0..2 {
                 assert!(system.factorize(&pattern, &blocks));
@@ -218,15 +292,50 @@ mod tests {
     #[test]
     fn large_sparse_patterns_take_the_sparse_path() {
         let (pattern, ..) = example(200);
-        assert!(matches!(CameraSystem::new(&pattern), CameraSystem::Sparse { .. }));
-        assert!(matches!(CameraSystem::new(&example(30).0), CameraSystem::Dense { .. }));
+        assert!(matches!(CameraSystem::new(&pattern, &Budget::ANY), Some(CameraSystem::Sparse { .. })));
+        assert!(matches!(CameraSystem::new(&example(30).0, &Budget::ANY), Some(CameraSystem::Dense { .. })));
     }
 
     #[test]
     fn refuses_an_indefinite_matrix() {
         let (pattern, mut blocks, _) = example(40);
         blocks[pattern.offset(7, 7)] = -1.0;
-        assert!(!CameraSystem::sparse(&pattern).unwrap().factorize(&pattern, &blocks));
+        assert!(!CameraSystem::sparse(&pattern, &Budget::ANY).unwrap().factorize(&pattern, &blocks));
         assert!(!CameraSystem::dense(pattern.size()).factorize(&pattern, &blocks));
+    }
+
+    #[test]
+    fn operations_are_those_of_the_columns_of_the_factor() {
+        let full = |count: usize| {
+            let mut pattern = BlockPattern::new(vec![6; count]);
+            for row in 0..count {
+                for column in 0..row {
+                    pattern.insert(row, column);
+                }
+            }
+            pattern
+        };
+        // Σ k² over all columns: the same whatever the order.
+        for count in [1, 30] {
+            let Some(CameraSystem::Sparse { symbolic, .. }) =
+                CameraSystem::sparse(&full(count), &Budget::ANY)
+            else {
+                panic!("sparse was asked for");
+            };
+            let size = (6 * count) as f64;
+            let expected = size * (size + 1.0) * (2.0 * size + 1.0) / 6.0;
+            assert!((operations(&symbolic) - expected).abs() < 1e-9 * expected);
+        }
+        let pattern = full(20);
+        let budget = |operations: f64| Budget { operations, ..Budget::ANY };
+        let least = (pattern.len() as f64).powi(2) / pattern.size() as f64;
+        assert!(budget(least * 1.01).may_suffice(&pattern) && !budget(least * 0.99).may_suffice(&pattern));
+        assert!(CameraSystem::new(&pattern, &budget(120.0_f64.powi(3) * 0.34)).is_some());
+        assert!(CameraSystem::new(&pattern, &budget(120.0_f64.powi(3) * 0.32)).is_none());
+        let (sparse, ..) = example(200);
+        assert!(CameraSystem::new(&sparse, &budget(1e3)).is_none());
+        assert!(
+            CameraSystem::new(&sparse, &Budget { values: 3 * sparse.len() / 2, ..Budget::ANY }).is_none()
+        );
     }
 }

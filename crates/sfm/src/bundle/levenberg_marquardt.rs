@@ -53,14 +53,27 @@ pub(super) struct Outcome {
     pub final_cost: f64,
     pub iterations: u32,
     pub accepted: u32,
+    pub linear_iterations: u64,
+    pub truncated_steps: u32,
     pub termination: Termination,
 }
 
 impl Outcome {
     /// The outcome of a problem without unknowns.
     pub fn nothing_to_do(cost: f64) -> Self {
-        let termination = Termination::NothingToDo;
-        Self { initial_cost: cost, final_cost: cost, iterations: 0, accepted: 0, termination }
+        Self::new(cost, Termination::NothingToDo)
+    }
+
+    fn new(cost: f64, termination: Termination) -> Self {
+        Self {
+            initial_cost: cost,
+            final_cost: cost,
+            iterations: 0,
+            accepted: 0,
+            linear_iterations: 0,
+            truncated_steps: 0,
+            termination,
+        }
     }
 }
 
@@ -74,13 +87,7 @@ pub(super) fn minimize<const D: usize, M: Model<D>>(
     limits: &Limits,
 ) -> Outcome {
     let mut cost = equations.linearize(model);
-    let mut outcome = Outcome {
-        initial_cost: cost,
-        final_cost: cost,
-        iterations: 0,
-        accepted: 0,
-        termination: Termination::IterationLimit,
-    };
+    let mut outcome = Outcome::new(cost, Termination::IterationLimit);
     if !cost.is_finite() {
         outcome.termination = Termination::NotFinite;
         return outcome;
@@ -130,5 +137,9 @@ pub(super) fn minimize<const D: usize, M: Model<D>>(
         }
     }
     outcome.final_cost = cost;
+    if let Some(system) = equations.iterative() {
+        outcome.linear_iterations = system.iterations();
+        outcome.truncated_steps = system.truncated();
+    }
     outcome
 }

@@ -7,22 +7,21 @@
 //!
 //! Work is cut into chunks of consecutive points whose number depends on the problem alone; each sums into its own
 //! memory and the chunks are added in order, so the bytes do not depend on the number of threads.
-
-use std::ops::Range;
+//!
+//! S is formed and factorized while that is within a [`Budget`]; beyond, only its diagonal blocks are, and products with
+//! it are made from U, V and W.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use setloc_features::MAX_CAMERA_PARAMS;
 
 use super::RobustLoss;
-use super::camera_system::CameraSystem;
+use super::camera_system::{Budget, CameraSystem};
+use super::elimination::{Chunk, Couplings, Slot, StepSums, bounded, for_each_chunk};
+use super::iterative::{ImplicitSchur, IterativeSystem};
 use super::loss::LossSum;
 use super::pattern::{BlockPattern, NONE};
 
-/// The damping is λ times the diagonal of H within these bounds.
-const DAMPING_RANGE: (f64, f64) = (1e-6, 1e32);
-/// A pivot of a point's 3×3 system counts as zero below this share of its diagonal entry.
-const VANISHING_PIVOT: f64 = 1e-13;
 /// Upper bound of the chunk count; more would cost more in reductions than it gains.
 const MAX_CHUNKS: usize = 8;
 /// Units of work (observations and pairs of them in a point) that are worth a chunk.
@@ -77,13 +76,6 @@ pub(super) trait Model<const D: usize>: Sync {
     fn squared_norm(&self) -> f64;
 }
 
-/// One (point, camera-side block) coupling; W of it is `dim`×3, by columns.
-#[derive(Debug, Clone, Copy)]
-struct Slot {
-    block: u32,
-    offset: u32,
-}
-
 /// Where an observation's products go.
 #[derive(Debug, Clone, Copy)]
 struct Target {
@@ -95,33 +87,28 @@ struct Target {
     extra: u32,
 }
 
-/// Consecutive points and all sums over them.
+/// What is unknown, and which of it each observation touches.
 #[derive(Debug, Default)]
-struct Chunk {
-    points: Range<usize>,
-    coupling: Vec<f64>,
-    point_hessian: Vec<[f64; 6]>,
-    point_gradient: Vec<[f64; 3]>,
-    base: Vec<f64>,
-    gradient: Vec<f64>,
-    schur: Vec<f64>,
-    reduced: Vec<f64>,
-    scratch: Vec<f64>,
-    candidate: Vec<Vector3<f64>>,
-    cost: f64,
-    sums: StepSums,
-    usable: bool,
+pub(super) struct Structure {
+    /// Of all observations, sorted by point; every point has at least one.
+    pub links: Vec<Link>,
+    /// Initial positions.
+    pub points: Vec<Vector3<f64>>,
+    /// Whether each point is an unknown.
+    pub free: Vec<bool>,
+    /// Number of camera-side blocks of size `D`.
+    pub block_count: usize,
+    /// Sizes of the further camera-side blocks.
+    pub extra_dims: Vec<usize>,
 }
 
-/// What a step does, summed over the unknowns.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct StepSums {
-    /// Decrease of the quadratic model.
-    pub predicted: f64,
-    /// ‖δ‖².
-    pub squared_step: f64,
-    /// ‖parameters‖².
-    pub squared_norm: f64,
+#[expect(clippy::large_enum_variant, reason = "one per problem, never moved in a loop")]
+/// How S δ = b is solved.
+enum ReducedSystem {
+    /// By a factorization of S.
+    Direct(CameraSystem),
+    /// By products with S.
+    Iterative(IterativeSystem),
 }
 
 /// The normal equations with all memory they ever need.
@@ -130,36 +117,27 @@ pub(super) struct NormalEquations<const D: usize> {
     targets: Vec<Target>,
     /// First observation of each point, and the end.
     observation_starts: Vec<usize>,
-    /// First slot of each point, and the end.
-    slot_starts: Vec<usize>,
-    slots: Vec<Slot>,
+    couplings: Couplings,
     points: Vec<Vector3<f64>>,
-    free: Vec<bool>,
     block_count: usize,
+    /// Blocks of S, or of U alone when S stays implicit.
     pattern: BlockPattern,
     chunks: Vec<Chunk>,
     base: Vec<f64>,
     gradient: Vec<f64>,
+    /// S in the blocks of the pattern; of an implicit S only the diagonal blocks are what they say.
     schur: Vec<f64>,
     step: Vec<f64>,
     damping: Vec<f64>,
-    system: CameraSystem,
+    system: ReducedSystem,
 }
 
 impl<const D: usize> NormalEquations<D> {
-    /// Plans the elimination.
-    ///
-    /// `links` are sorted by point; every point has at least one. `block_count` blocks of size `D` and the
-    /// extra blocks make the camera side.
-    pub fn new(
-        links: Vec<Link>,
-        points: Vec<Vector3<f64>>,
-        free: Vec<bool>,
-        block_count: usize,
-        extra: &[usize],
-    ) -> Self {
+    /// Plans the elimination. S is formed and factorized within the budget, else solved by its products.
+    pub fn new(structure: Structure, budget: &Budget) -> Self {
+        let Structure { links, points, free, block_count, extra_dims } = structure;
         let mut dims = vec![D; block_count];
-        dims.extend_from_slice(extra);
+        dims.extend(extra_dims);
         let mut pattern = BlockPattern::new(dims);
         let extra_block = |link: &Link| block_count + link.extra as usize;
         for link in &links {
@@ -169,7 +147,7 @@ impl<const D: usize> NormalEquations<D> {
         }
         let mut observation_starts = Vec::with_capacity(points.len() + 1);
         observation_starts.push(0);
-        let (mut slot_starts, mut slots) = (vec![0], Vec::new());
+        let mut couplings = Couplings { starts: vec![0], slots: Vec::new(), free };
         let mut work_until = Vec::with_capacity(points.len());
         let (mut work, mut end, mut touched) = (0, 0, Vec::new());
         for point in 0..points.len() {
@@ -178,7 +156,7 @@ impl<const D: usize> NormalEquations<D> {
                 end += 1;
             }
             touched.clear();
-            if free[point] {
+            if couplings.free[point] {
                 for link in &links[start..end] {
                     if link.block != NONE {
                         touched.push(link.block);
@@ -189,21 +167,29 @@ impl<const D: usize> NormalEquations<D> {
                 }
                 touched.sort_unstable();
                 touched.dedup();
-                for (index, &row) in touched.iter().enumerate() {
-                    for &column in &touched[..=index] {
-                        pattern.insert(row as usize, column as usize);
-                    }
-                }
             }
-            slots.extend(touched.iter().map(|&block| Slot { block, offset: 0 }));
-            slot_starts.push(slots.len());
+            couplings.slots.extend(touched.iter().map(|&block| Slot { block, offset: 0 }));
+            couplings.starts.push(couplings.slots.len());
             observation_starts.push(end);
             work += 2 * (end - start) + touched.len() * touched.len();
             work_until.push(work);
         }
 
-        let most = (MAX_CHUNK_VALUES / pattern.len().max(1)).clamp(1, MAX_CHUNKS);
-        let chunk_count = (work / WORK_PER_CHUNK).clamp(1, most);
+        let chunks_of = |len: usize| {
+            (work / WORK_PER_CHUNK).clamp(1, (MAX_CHUNK_VALUES / len.max(1)).clamp(1, MAX_CHUNKS))
+        };
+        let direct = with_fill(&pattern, &couplings, budget).and_then(|filled| {
+            let accumulated = filled.len() * (1 + chunks_of(filled.len()));
+            let system = CameraSystem::new(&filled, &budget.without(accumulated)?)?;
+            Some((filled, ReducedSystem::Direct(system)))
+        });
+        let (pattern, system) = direct.unwrap_or_else(|| {
+            let system = ReducedSystem::Iterative(IterativeSystem::new(&pattern));
+            (pattern, system)
+        });
+
+        let chunk_count = chunks_of(pattern.len());
+        let is_implicit = matches!(system, ReducedSystem::Iterative(_));
         let mut chunks = Vec::with_capacity(chunk_count);
         let mut first = 0;
         for index in 0..chunk_count {
@@ -215,7 +201,7 @@ impl<const D: usize> NormalEquations<D> {
             let (mut coupling_len, mut scratch_len) = (0, 0);
             for point in first..last {
                 let before = coupling_len;
-                for slot in &mut slots[slot_starts[point]..slot_starts[point + 1]] {
+                for slot in &mut couplings.slots[couplings.starts[point]..couplings.starts[point + 1]] {
                     slot.offset = coupling_len as u32;
                     coupling_len += 3 * pattern.dim(slot.block as usize);
                 }
@@ -226,6 +212,7 @@ impl<const D: usize> NormalEquations<D> {
                 coupling: vec![0.0; coupling_len],
                 point_hessian: vec![[0.0; 6]; last - first],
                 point_gradient: vec![[0.0; 3]; last - first],
+                factors: vec![[0.0; 6]; if is_implicit { last - first } else { 0 }],
                 base: vec![0.0; pattern.base_len()],
                 gradient: vec![0.0; pattern.size()],
                 schur: vec![0.0; pattern.len()],
@@ -240,8 +227,7 @@ impl<const D: usize> NormalEquations<D> {
         let targets = links
             .iter()
             .map(|link| {
-                let point = link.point as usize;
-                let of_point = &slots[slot_starts[point]..slot_starts[point + 1]];
+                let of_point = couplings.of_point(link.point as usize);
                 let offset_of = |block: u32| {
                     of_point
                         .binary_search_by_key(&block, |slot| slot.block)
@@ -260,15 +246,12 @@ impl<const D: usize> NormalEquations<D> {
                 }
             })
             .collect();
-        let system = CameraSystem::new(&pattern);
         Self {
             links,
             targets,
             observation_starts,
-            slot_starts,
-            slots,
+            couplings,
             points,
-            free,
             block_count,
             base: vec![0.0; pattern.base_len()],
             gradient: vec![0.0; pattern.size()],
@@ -293,13 +276,22 @@ impl<const D: usize> NormalEquations<D> {
 
     /// Number of scalar unknowns.
     pub fn unknowns(&self) -> usize {
-        self.pattern.size() + 3 * self.free.iter().filter(|&&free| free).count()
+        self.pattern.size() + 3 * self.couplings.free.iter().filter(|&&free| free).count()
+    }
+
+    /// The iterative system with its counts, unless S is factorized.
+    pub fn iterative(&self) -> Option<&IterativeSystem> {
+        match &self.system {
+            ReducedSystem::Direct(_) => None,
+            ReducedSystem::Iterative(system) => Some(system),
+        }
     }
 
     /// Builds H and g at the current state; returns the cost.
     pub fn linearize<M: Model<D>>(&mut self, model: &M) -> f64 {
-        let Self { links, targets, observation_starts, points, free, block_count, pattern, chunks, .. } =
-            self;
+        let Self {
+            links, targets, observation_starts, points, couplings, block_count, pattern, chunks, ..
+        } = self;
         let loss = model.loss();
         for_each_chunk(chunks, |chunk| {
             chunk.coupling.fill(0.0);
@@ -322,7 +314,7 @@ impl<const D: usize> NormalEquations<D> {
                     let (r0, r1) = (weight * r0, weight * r1);
                     let [p0, p1] = &lin.point;
                     let weighted = [p0.map(|value| weight * value), p1.map(|value| weight * value)];
-                    if free[point] {
+                    if couplings.free[point] {
                         let [q0, q1] = &weighted;
                         v[0] += q0[0] * p0[0] + q1[0] * p1[0];
                         v[1] += q0[1] * p0[0] + q1[1] * p1[0];
@@ -412,7 +404,7 @@ impl<const D: usize> NormalEquations<D> {
         cost
     }
 
-    /// Eliminates the points and factorizes S for damping λ; false when that fails.
+    /// Eliminates the points and factorizes S, or its diagonal blocks, for damping λ; false when that fails.
     pub fn factorize(&mut self, lambda: f64) -> bool {
         for block in 0..self.pattern.block_count() {
             let (offset, dim, start) =
@@ -421,10 +413,8 @@ impl<const D: usize> NormalEquations<D> {
                 self.damping[start + k] = lambda * bounded(self.base[offset + k * (dim + 1)]);
             }
         }
-        let Self { slot_starts, slots, free, block_count, pattern, chunks, .. } = self;
-        for_each_chunk(chunks, |chunk| {
-            eliminate::<D>(chunk, lambda, slot_starts, slots, free, *block_count, pattern);
-        });
+        let Self { couplings, pattern, chunks, .. } = self;
+        for_each_chunk(chunks, |chunk| chunk.eliminate::<D>(lambda, couplings, pattern));
         if !self.chunks.iter().all(|chunk| chunk.usable) {
             return false;
         }
@@ -450,10 +440,19 @@ impl<const D: usize> NormalEquations<D> {
                 self.schur[offset + k * (dim + 1)] += self.damping[start + k];
             }
         }
-        self.pattern.size() == 0 || self.system.factorize(&self.pattern, &self.schur)
+        self.factorize_schur()
     }
 
-    /// The damped step after [`NormalEquations::factorize`] with the same λ; `None` when it is not finite.
+    fn factorize_schur(&mut self) -> bool {
+        let Self { pattern, schur, system, .. } = self;
+        match system {
+            _ if pattern.size() == 0 => true,
+            ReducedSystem::Direct(system) => system.factorize(pattern, schur),
+            ReducedSystem::Iterative(system) => system.prepare(pattern, schur),
+        }
+    }
+
+    /// The damped step after [`NormalEquations::factorize`] with the same λ; `None` when there is none.
     ///
     /// The candidate points are set; the camera-side step is in [`NormalEquations::step`].
     pub fn solve(&mut self, lambda: f64) -> Option<StepSums> {
@@ -465,13 +464,21 @@ impl<const D: usize> NormalEquations<D> {
                 *step += reduced;
             }
         }
-        if !self.step.is_empty() {
-            self.system.solve(&mut self.step);
+        let Self { couplings, points, pattern, chunks, step, base, damping, system, .. } = self;
+        if !step.is_empty() {
+            match system {
+                ReducedSystem::Direct(system) => system.solve(step),
+                ReducedSystem::Iterative(system) => {
+                    let schur = ImplicitSchur { couplings, pattern, base, damping };
+                    let multiply = |x: &[f64], to: &mut [f64]| schur.multiply::<D>(chunks, x, to);
+                    if !system.solve(pattern, step, multiply) {
+                        return None;
+                    }
+                }
+            }
         }
-        let Self { slot_starts, slots, points, free, pattern, chunks, step, .. } = self;
-        for_each_chunk(chunks, |chunk| {
-            substitute(chunk, lambda, step, points, slot_starts, slots, free, pattern);
-        });
+        for_each_chunk(chunks, |chunk| chunk.substitute(lambda, step, points, couplings, pattern));
+        // What the model decreases by also holds for conjugate gradients: what they leave is perpendicular to their step.
         let mut sums = StepSums::default();
         for ((step, gradient), damping) in self.step.iter().zip(&self.gradient).zip(&self.damping) {
             sums.predicted += 0.5 * step * (damping * step - gradient);
@@ -518,26 +525,40 @@ impl<const D: usize> NormalEquations<D> {
                 self.schur[offset + k * (dim + 1)] -= share * self.base[offset + k * (dim + 1)];
             }
         }
-        self.pattern.size() == 0 || self.system.factorize(&self.pattern, &self.schur)
+        self.factorize_schur()
     }
 
-    /// Solves S x = `right` in place, after [`NormalEquations::factorize`].
-    pub fn solve_camera_side(&mut self, right: &mut [f64]) {
-        self.system.solve(right);
+    /// Solves S x = `right` in place, after [`NormalEquations::factorize`]; false when S is not factorized as a whole.
+    pub fn solve_camera_side(&mut self, right: &mut [f64]) -> bool {
+        match &mut self.system {
+            ReducedSystem::Direct(system) => {
+                system.solve(right);
+                true
+            }
+            ReducedSystem::Iterative(_) => false,
+        }
     }
+}
+
+/// The blocks of U and those that shared points fill in; `None` when their are beyond the budget.
+fn with_fill(base: &BlockPattern, couplings: &Couplings, budget: &Budget) -> Option<BlockPattern> {
+    let mut pattern = base.clone();
+    for point in 0..couplings.free.len() {
+        if !budget.may_suffice(&pattern) {
+            return None;
+        }
+        let of_point = couplings.of_point(point);
+        for (index, row) in of_point.iter().enumerate() {
+            for column in &of_point[..=index] {
+                pattern.insert(row.block as usize, column.block as usize);
+            }
+        }
+    }
+    Some(pattern)
 }
 
 /// Values of S that one task sums over all chunks.
 const SEGMENT: usize = 1 << 14;
-
-fn for_each_chunk(chunks: &mut [Chunk], work: impl Fn(&mut Chunk) + Send + Sync) {
-    // One chunk stays on this thread: small problems never wait for another.
-    if let [chunk] = chunks {
-        work(chunk);
-    } else {
-        chunks.par_iter_mut().for_each(work);
-    }
-}
 
 #[inline]
 fn add(to: &mut [f64], from: &[f64]) {
@@ -556,150 +577,127 @@ fn add_product(to: &mut [f64], weight: f64, a: [&[f64]; 2], b: [&[f64]; 2]) {
     }
 }
 
-#[inline]
-fn bounded(diagonal: f64) -> f64 {
-    diagonal.clamp(DAMPING_RANGE.0, DAMPING_RANGE.1)
-}
+#[cfg(test)]
+mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
 
-/// Cholesky factor of V + λD (lower triangle by rows) with reciprocal diagonal; `None` when it is not finite.
-///
-/// A pivot that vanishes (the depth of a point seen once, without damping) gets the reciprocal zero. That makes a
-/// generalized inverse, which is enough: W and g_p lie in the range of V.
-#[inline]
-fn point_factor(v: &[f64; 6], lambda: f64) -> Option<[f64; 6]> {
-    let reciprocal_root = |pivot: f64, diagonal: f64| {
-        if pivot <= VANISHING_PIVOT * diagonal { 0.0 } else { 1.0 / pivot.sqrt() }
-    };
-    let damped = |value: f64| value + lambda * bounded(value);
-    let (d0, d1, d2) = (damped(v[0]), damped(v[2]), damped(v[5]));
-    let i00 = reciprocal_root(d0, d0);
-    let (l10, l20) = (v[1] * i00, v[3] * i00);
-    let i11 = reciprocal_root(d1 - l10 * l10, d1);
-    let l21 = (v[4] - l20 * l10) * i11;
-    let i22 = reciprocal_root(d2 - l20 * l20 - l21 * l21, d2);
-    // What is not finite before reaches the last pivot.
-    (i00.is_finite() && i11.is_finite() && i22.is_finite()).then_some([i00, l10, i11, l20, l21, i22])
-}
+    use super::*;
+    use crate::bundle::LinearSolver;
 
-fn eliminate<const D: usize>(
-    chunk: &mut Chunk,
-    lambda: f64,
-    slot_starts: &[usize],
-    slots: &[Slot],
-    free: &[bool],
-    block_count: usize,
-    pattern: &BlockPattern,
-) {
-    chunk.schur.fill(0.0);
-    chunk.reduced.fill(0.0);
-    chunk.usable = true;
-    for (index, point) in chunk.points.clone().enumerate() {
-        let of_point = &slots[slot_starts[point]..slot_starts[point + 1]];
-        if !free[point] || of_point.is_empty() {
-            continue;
+    /// Residuals that are linear in what they touch, with Jacobians drawn at random.
+    struct Linear(Vec<Linearized<3>>);
+
+    impl Model<3> for Linear {
+        fn loss(&self) -> RobustLoss {
+            RobustLoss::Trivial
         }
-        let Some([i00, l10, i11, l20, l21, i22]) = point_factor(&chunk.point_hessian[index], lambda) else {
-            chunk.usable = false;
-            continue;
-        };
-        let g = &chunk.point_gradient[index];
-        let z0 = g[0] * i00;
-        let z1 = (g[1] - l10 * z0) * i11;
-        let z2 = (g[2] - l20 * z0 - l21 * z1) * i22;
-        let first = of_point[0].offset as usize;
-        for slot in of_point {
-            let dim = pattern.dim(slot.block as usize);
-            let w = &chunk.coupling[slot.offset as usize..][..3 * dim];
-            let y = &mut chunk.scratch[slot.offset as usize - first..][..3 * dim];
-            let start = pattern.start(slot.block as usize);
-            let reduced = &mut chunk.reduced[start..start + dim];
-            for row in 0..dim {
-                let y0 = w[row] * i00;
-                let y1 = (w[dim + row] - l10 * y0) * i11;
-                let y2 = (w[2 * dim + row] - l20 * y0 - l21 * y1) * i22;
-                (y[row], y[dim + row], y[2 * dim + row]) = (y0, y1, y2);
-                reduced[row] += y0 * z0 + y1 * z1 + y2 * z2;
+        fn linearize(&self, observation: usize, _: &Link, _: &Vector3<f64>, out: &mut Linearized<3>) {
+            *out = self.0[observation];
+        }
+        fn squared_residual(&self, observation: usize, _: &Vector3<f64>) -> f64 {
+            self.0[observation].residual.iter().map(|residual| residual * residual).sum()
+        }
+        fn linearize_block_terms(&self, add: BlockTerm<'_, 3>) -> f64 {
+            add(1, &[[2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 4.0]], &[0.5, 0.6, 0.7]);
+            0.0
+        }
+        fn block_terms_cost(&self) -> f64 {
+            0.0
+        }
+        fn propose(&mut self, _: &[f64]) -> bool {
+            true
+        }
+        fn accept(&mut self) {}
+        fn squared_norm(&self) -> f64 {
+            1.0
+        }
+    }
+
+    /// Seven blocks, two further blocks of 2 and 4 scalars, fixed points, a fixed block, a point seen twice by one.
+    fn example() -> (Linear, impl Fn() -> Structure) {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let (mut links, mut linear) = (Vec::new(), Vec::new());
+        for point in 0..60 {
+            for _ in 0..rng.random_range(2..5) {
+                let block = rng.random_range(0..8);
+                let extra = if block % 3 == 2 { NONE } else { block % 3 };
+                links.push(Link { point, block: if block == 7 { NONE } else { block }, extra });
+                let mut draw = || rng.random_range(-1.0..1.0);
+                linear.push(Linearized {
+                    residual: [draw(), draw()],
+                    point: [(); 2].map(|()| [(); 3].map(|()| draw())),
+                    block: [(); 2].map(|()| [(); 3].map(|()| draw())),
+                    extra: [(); 2].map(|()| [(); MAX_CAMERA_PARAMS].map(|()| draw())),
+                });
             }
         }
-        for (position, row) in of_point.iter().enumerate() {
-            let row_dim = pattern.dim(row.block as usize);
-            let row_y = &chunk.scratch[row.offset as usize - first..][..3 * row_dim];
-            for column in &of_point[..=position] {
-                let column_dim = pattern.dim(column.block as usize);
-                let column_y = &chunk.scratch[column.offset as usize - first..][..3 * column_dim];
-                let offset = pattern.offset(row.block as usize, column.block as usize);
-                let values = &mut chunk.schur[offset..offset + row_dim * column_dim];
-                if (row.block as usize) < block_count {
-                    subtract_outer::<D>(values, row_y, column_y);
-                } else {
-                    subtract_outer_sized(values, row_y, column_y, row_dim, column_dim);
+        let structure = move || Structure {
+            links: links.clone(),
+            points: vec![Vector3::zeros(); 60],
+            free: (0..60).map(|point| point % 9 != 0).collect(),
+            block_count: 7,
+            extra_dims: vec![2, 4],
+        };
+        (Linear(linear), structure)
+    }
+
+    #[test]
+    fn implicit_products_and_preconditioner_are_those_of_the_explicit_system() {
+        let (model, structure) = example();
+        let mut direct =
+            NormalEquations::<3>::new(structure(), &Budget::new(LinearSolver::Direct, model.0.len()));
+        let mut implicit =
+            NormalEquations::<3>::new(structure(), &Budget::new(LinearSolver::Iterative, model.0.len()));
+        for equations in [&mut direct, &mut implicit] {
+            equations.linearize(&model);
+            assert!(equations.factorize(1e-3));
+        }
+        assert!(implicit.schur.len() < direct.schur.len());
+        let size = direct.pattern.size();
+        let mut explicit = vec![vec![0.0; size]; size];
+        for column_block in 0..direct.pattern.block_count() {
+            let (columns, start) = (direct.pattern.dim(column_block), direct.pattern.start(column_block));
+            for (row_block, offset) in direct.pattern.column(column_block) {
+                let rows = direct.pattern.dim(row_block);
+                for (index, &value) in direct.schur[offset..offset + rows * columns].iter().enumerate() {
+                    let row = direct.pattern.start(row_block) + index % rows;
+                    let column = start + index / rows;
+                    explicit[column][row] = value;
+                    explicit[row][column] = value;
                 }
             }
         }
-    }
-}
-
-/// values (D×D) −= a bᵀ with a, b of D×3, all by columns.
-#[inline]
-fn subtract_outer<const D: usize>(values: &mut [f64], a: &[f64], b: &[f64]) {
-    let ([a0, a1, a2], [b0, b1, b2]) = (a.as_chunks::<D>().0, b.as_chunks::<D>().0) else { return };
-    for (column, values) in values.as_chunks_mut::<D>().0.iter_mut().enumerate() {
-        for row in 0..D {
-            values[row] -= a0[row] * b0[column] + a1[row] * b1[column] + a2[row] * b2[column];
-        }
-    }
-}
-
-/// The same for any sizes.
-fn subtract_outer_sized(values: &mut [f64], a: &[f64], b: &[f64], rows: usize, columns: usize) {
-    for column in 0..columns {
-        let (b0, b1, b2) = (b[column], b[columns + column], b[2 * columns + column]);
-        for row in 0..rows {
-            values[column * rows + row] -= a[row] * b0 + a[rows + row] * b1 + a[2 * rows + row] * b2;
-        }
-    }
-}
-
-#[expect(clippy::too_many_arguments, reason = "disjoint borrows of one struct")]
-fn substitute(
-    chunk: &mut Chunk,
-    lambda: f64,
-    step: &[f64],
-    points: &[Vector3<f64>],
-    slot_starts: &[usize],
-    slots: &[Slot],
-    free: &[bool],
-    pattern: &BlockPattern,
-) {
-    chunk.sums = StepSums::default();
-    for (index, point) in chunk.points.clone().enumerate() {
-        if !free[point] {
-            continue;
-        }
-        let (v, g) = (&chunk.point_hessian[index], &chunk.point_gradient[index]);
-        let Some([i00, l10, i11, l20, l21, i22]) = point_factor(v, lambda) else { continue };
-        let mut right = *g;
-        for slot in &slots[slot_starts[point]..slot_starts[point + 1]] {
-            let (dim, start) = (pattern.dim(slot.block as usize), pattern.start(slot.block as usize));
-            let w = &chunk.coupling[slot.offset as usize..][..3 * dim];
-            let camera_step = &step[start..start + dim];
-            for k in 0..3 {
-                right[k] +=
-                    w[k * dim..(k + 1) * dim].iter().zip(camera_step).map(|(w, step)| w * step).sum::<f64>();
+        let NormalEquations { couplings, pattern, base, damping, chunks, schur, .. } = &mut implicit;
+        let operator = ImplicitSchur { couplings, pattern, base, damping };
+        for (column, explicit) in explicit.iter().enumerate() {
+            let (mut x, mut product) = (vec![0.0; size], vec![0.0; size]);
+            x[column] = 1.0;
+            operator.multiply::<3>(chunks, &x, &mut product);
+            for (product, explicit) in product.iter().zip(explicit) {
+                assert!((product - explicit).abs() < 1e-12, "column {column}: {product} {explicit}");
             }
         }
-        let z0 = right[0] * i00;
-        let z1 = (right[1] - l10 * z0) * i11;
-        let z2 = (right[2] - l20 * z0 - l21 * z1) * i22;
-        let d2 = z2 * i22;
-        let d1 = (z1 - l21 * d2) * i11;
-        let d0 = (z0 - l10 * d1 - l20 * d2) * i00;
-        let delta = Vector3::new(-d0, -d1, -d2);
-        chunk.candidate[index] = points[point] + delta;
-        for (k, diagonal) in [v[0], v[2], v[5]].into_iter().enumerate() {
-            chunk.sums.predicted += 0.5 * delta[k] * (lambda * bounded(diagonal) * delta[k] - g[k]);
+        for block in 0..pattern.block_count() {
+            let (offset, dim) = (pattern.offset(block, block), pattern.dim(block));
+            let explicit = &direct.schur[direct.pattern.offset(block, block)..][..dim * dim];
+            assert_eq!(&schur[offset..offset + dim * dim], explicit);
         }
-        chunk.sums.squared_step += delta.norm_squared();
-        chunk.sums.squared_norm += points[point].norm_squared();
+    }
+
+    #[test]
+    fn pattern_within_the_budget_is_factorized_and_beyond_it_is_not() {
+        let (model, structure) = example();
+        let count = model.0.len();
+        for (solver, is_direct) in
+            [(LinearSolver::Auto, true), (LinearSolver::Direct, true), (LinearSolver::Iterative, false)]
+        {
+            let equations = NormalEquations::<3>::new(structure(), &Budget::new(solver, count));
+            assert_eq!(matches!(equations.system, ReducedSystem::Direct(_)), is_direct, "{solver:?}");
+        }
+        let needed = NormalEquations::<3>::new(structure(), &Budget::MEMORY).pattern.len();
+        let tight = Budget::MEMORY.without((1 << 28) - needed).unwrap();
+        let equations = NormalEquations::<3>::new(structure(), &tight);
+        assert!(matches!(equations.system, ReducedSystem::Iterative(_)), "no room for the factor");
     }
 }

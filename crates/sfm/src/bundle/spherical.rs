@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector2, Vector3};
 use rayon::prelude::*;
 use setloc_features::{Camera, CameraModel, MAX_CAMERA_PARAMS};
 
-use super::normal_equations::{BlockTerm, Linearized, Link, Model};
+use super::normal_equations::{BlockTerm, Linearized, Link, Model, Structure};
 use super::pattern::NONE;
 use super::residual::{angular, angular_squared, bearing_change, point_row, rotation_row};
 use super::{BundleProblem, IntrinsicsFreedom, RobustLoss};
@@ -80,12 +80,9 @@ pub(super) struct Spherical {
 
 /// How a problem maps to unknowns.
 pub(super) struct Layout {
-    pub links: Vec<Link>,
-    pub points: Vec<Vector3<f64>>,
-    pub free: Vec<bool>,
+    pub structure: Structure,
     /// Index in the problem of each compacted point.
     pub point_of_index: Vec<u32>,
-    pub extra_dims: Vec<usize>,
     pub ignored: usize,
     /// Priors used and weighed, of free poses.
     pub priors: usize,
@@ -226,15 +223,14 @@ impl Spherical {
         }
 
         let poses: Vec<_> = problem.poses.iter().map(|pose| PoseState::new(pose.world_from_camera)).collect();
-        let layout = Layout {
+        let structure = Structure {
             links,
             points,
             free,
-            point_of_index,
+            block_count: pose_of_block.len(),
             extra_dims: intrinsics.iter().map(|(_, parameters)| parameters.len()).collect(),
-            ignored,
-            priors: priors.len(),
         };
+        let layout = Layout { structure, point_of_index, ignored, priors: priors.len() };
         let model = Self {
             loss,
             rays,
@@ -249,11 +245,6 @@ impl Spherical {
             priors,
         };
         (model, layout)
-    }
-
-    /// Number of pose blocks.
-    pub fn block_count(&self) -> usize {
-        self.pose_of_block.len()
     }
 
     /// Block of a pose, when it is an unknown.
