@@ -190,7 +190,7 @@ impl<const D: usize> NormalEquations<D> {
 
         let chunk_count = chunks_of(pattern.len());
         let is_implicit = matches!(system, ReducedSystem::Iterative(_));
-        let mut chunks = Vec::with_capacity(chunk_count);
+        let (mut ranges, mut slots_left) = (Vec::with_capacity(chunk_count), &mut couplings.slots[..]);
         let mut first = 0;
         for index in 0..chunk_count {
             let last = if index + 1 == chunk_count {
@@ -198,34 +198,43 @@ impl<const D: usize> NormalEquations<D> {
             } else {
                 work_until.partition_point(|&until| until <= work * (index + 1) / chunk_count).max(first)
             };
+            let own = couplings.starts[last] - couplings.starts[first];
+            let (slots, others) = std::mem::take(&mut slots_left).split_at_mut(own);
+            ranges.push((first..last, slots));
+            (first, slots_left) = (last, others);
+        }
+        let chunk = |(range, slots): (std::ops::Range<usize>, &mut [Slot])| {
             let (mut coupling_len, mut scratch_len) = (0, 0);
-            for point in first..last {
+            for point in range.clone() {
                 let before = coupling_len;
-                for slot in &mut couplings.slots[couplings.starts[point]..couplings.starts[point + 1]] {
+                let first = couplings.starts[range.start];
+                for slot in &mut slots[couplings.starts[point] - first..couplings.starts[point + 1] - first] {
                     slot.offset = coupling_len as u32;
                     coupling_len += 3 * pattern.dim(slot.block as usize);
                 }
                 scratch_len = scratch_len.max(coupling_len - before);
             }
-            chunks.push(Chunk {
-                points: first..last,
+            let count = range.len();
+            Chunk {
+                candidate: points[range.clone()].to_vec(),
+                points: range,
                 coupling: vec![0.0; coupling_len],
-                point_hessian: vec![[0.0; 6]; last - first],
-                point_gradient: vec![[0.0; 3]; last - first],
-                factors: vec![[0.0; 6]; if is_implicit { last - first } else { 0 }],
+                point_hessian: vec![[0.0; 6]; count],
+                point_gradient: vec![[0.0; 3]; count],
+                factors: vec![[0.0; 6]; if is_implicit { count } else { 0 }],
                 base: vec![0.0; pattern.base_len()],
                 gradient: vec![0.0; pattern.size()],
                 schur: vec![0.0; pattern.len()],
                 reduced: vec![0.0; pattern.size()],
                 scratch: vec![0.0; scratch_len],
-                candidate: points[first..last].to_vec(),
                 ..Chunk::default()
-            });
-            first = last;
-        }
+            }
+        };
+        let chunks = ranges.into_par_iter().map(chunk).collect();
 
         let targets = links
-            .iter()
+            .par_iter()
+            .with_min_len(WORK_PER_CHUNK)
             .map(|link| {
                 let of_point = couplings.of_point(link.point as usize);
                 let offset_of = |block: u32| {

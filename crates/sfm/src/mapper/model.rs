@@ -284,8 +284,7 @@ impl<'a> Model<'a> {
                 world_from_camera: pose.map(|pose| pose.world_from_camera),
             })
             .collect();
-        let mut points = Vec::new();
-        for point in self.points.iter().flatten() {
+        let finished = |point: &ModelPoint| {
             let mut track = point.track.clone();
             track.sort_unstable();
             let (mut color_sum, mut squared_error) = ([0_u32; 3], 0.0);
@@ -298,15 +297,16 @@ impl<'a> Model<'a> {
                 squared_error += self.error_sigma(observation, &point.position).unwrap_or(0.0).powi(2);
             }
             let n = track.len().max(1);
-            points.push(ReconstructionPoint {
+            ReconstructionPoint {
                 position: point.position,
                 color: color_sum.map(|sum| (sum / n as u32) as u8),
                 error_sigma: (squared_error / n as f64).sqrt(),
                 covariance: None,
                 aligned: None,
                 track,
-            });
-        }
+            }
+        };
+        let points = self.points.par_iter().flatten().map(finished).collect();
         Reconstruction { cameras: self.cameras, images, points }
     }
 }
