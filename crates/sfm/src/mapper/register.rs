@@ -49,6 +49,18 @@ impl Visibility {
     }
 }
 
+impl std::iter::Sum for Visibility {
+    /// What several images see in common.
+    fn sum<I: Iterator<Item = Self>>(all: I) -> Self {
+        all.fold(Self::default(), |sum, one| Self {
+            expected: sum.expected + one.expected,
+            matched: sum.matched + one.matched,
+            expected_cells: sum.expected_cells + one.expected_cells,
+            matched_cells: sum.matched_cells + one.matched_cells,
+        })
+    }
+}
+
 /// Number of 2D-to-3D matches that [`scene_matches`] would find.
 pub(super) fn count_scene_matches(model: &Model<'_>, graph: &CorrespondenceGraph, image: ImageId) -> usize {
     // Most images wait far from the model.
@@ -281,6 +293,17 @@ pub(super) fn visibility(
     world_from_camera: &Rigid,
     inliers: &[(u32, PointId)],
 ) -> Visibility {
+    visibility_beside(model, image, world_from_camera, inliers, &model.registered_neighbours(image))
+}
+
+/// [`visibility`] of what these registered images see.
+pub(super) fn visibility_beside(
+    model: &Model<'_>,
+    image: ImageId,
+    world_from_camera: &Rigid,
+    inliers: &[(u32, PointId)],
+    others: &[ImageId],
+) -> Visibility {
     let mut is_inlier = vec![false; model.points.len()];
     for (_, id) in inliers {
         is_inlier[id.index()] = true;
@@ -290,7 +313,7 @@ pub(super) fn visibility(
     let mut counts = Visibility::default();
     let mut cells = vec![(0_usize, 0_usize); direction::CELLS];
     let mut familiar = vec![false; model.points.len()];
-    for other in model.registered_neighbours(image) {
+    for &other in others {
         let Some(pose) = &model.poses[other.index()] else { continue };
         for (_, id) in model.observations_of(other) {
             let Some(point) = model.point(id).filter(|_| !familiar[id.index()]) else { continue };
