@@ -9,15 +9,18 @@
 //! has been adjusted together.
 
 mod crossing;
+mod likeness;
 mod similarity;
 
 use std::collections::BTreeSet;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use setloc_features::GuidedParams;
 
 use self::{
-    crossing::{Crossing, Sides, distinct},
+    crossing::{Crossing, Sides, distinct, once},
+    likeness::{Likeness, likeness},
     similarity::Sights,
 };
 use super::{
@@ -72,12 +75,24 @@ pub struct MergeRecord {
     pub expected_cells: [usize; 2],
     /// Directions among them in which any was matched.
     pub matched_cells: [usize; 2],
+    /// Matches that there would be if the images matched the other component as they match their own.
+    pub expected_matches: f64,
+    /// Those that there are, of all that could be found.
+    pub found_matches: f64,
 }
 
+/// Fewest matches of a similarity that more are sought for.
+const MIN_SEED: usize = 6;
+/// Half widths of the bands about the epipolar circles in which they are sought, one after the other.
+const GUIDED_BANDS_RAD: [f64; 3] = [0.02, 0.008, 0.004];
 /// Matches of an image that make it count for the scale between two components: one more than its pose needs.
 const IMAGE_MATCHES: usize = 4;
 /// Largest standard deviation of the logarithm of the scale between two components.
 const MAX_LOG_SCALE_SIGMA: f64 = 0.05;
+/// Fewest matches that likeness must expect to judge by it.
+const MIN_EXPECTED_MATCHES: f64 = 10.0;
+/// Smallest share of the matches expected by likeness.
+const MIN_LIKENESS: f64 = 0.3;
 /// How many times more matches must agree when too little is in plain view to be judged by.
 const UNJUDGED_SUPPORT: usize = 2;
 /// Two similarities that differ by less than this share of the distance to what is seen are one.
@@ -161,6 +176,8 @@ struct Hypothesis {
     support: usize,
     /// What the moved images see of the kept points, and the kept images of the moved points.
     seen: [Visibility; 2],
+    /// What either matches of the other, measured by what each matches of itself; further matches included.
+    likeness: Likeness,
 }
 
 struct Attempt<'p, 'm, 'a> {
@@ -175,7 +192,6 @@ impl<'a> Attempt<'_, '_, 'a> {
     fn run(&self, taken: Vec<bool>, report: &mut MapperReport) -> Option<Part> {
         let crossings = self.sides.crossings();
         let candidates = distinct(&crossings);
-        eprintln!("DBG candidates {candidates} of {}", crossings.len());
         if candidates < self.params.min_registration_inliers {
             return None;
         }
@@ -194,24 +210,22 @@ impl<'a> Attempt<'_, '_, 'a> {
                 verdicts[best] = if rival { MergeVerdict::Ambiguous } else { MergeVerdict::Contradicted };
             }
         }
-        let seen = hypotheses.get(best).map(|hypothesis| hypothesis.seen).unwrap_or_default();
-        let support = hypotheses.get(best).map_or(0, |hypothesis| hypothesis.support);
         let of_part = |part: &Part| part.component.registered().next().unwrap_or(ImageId(0));
-        for h in &hypotheses {
-            let q = h.kept_from_moved.rotation.coords;
-            let t = h.kept_from_moved.translation;
-            eprintln!("DBG {:?} {:?} support {} seen {:?} agreement {} sigma {:?} SIM {} {} {} {} {} {} {} {}", [self.kept.size(), self.moved.size()], self.judge(&crossings, h), h.support, h.seen.map(|s| [s.expected, s.matched, s.expected_cells, s.matched_cells]), self.pair_agreement(&h.kept_from_moved), Sights::collect(&self.sides, h.agreeing.iter()).log_scale_sigma(&h.kept_from_moved, 1.0), h.kept_from_moved.scale, q.x, q.y, q.z, q.w, t.x, t.y, t.z);
-        }
+        let best_found = hypotheses.get(best);
+        let seen = best_found.map(|hypothesis| hypothesis.seen).unwrap_or_default();
+        let likeness = best_found.map(|hypothesis| hypothesis.likeness).unwrap_or_default();
         report.merges.push(MergeRecord {
             first_images: [of_part(self.kept), of_part(self.moved)],
             images: [self.kept.size(), self.moved.size()],
             verdict: verdicts.get(best).copied().unwrap_or(MergeVerdict::Unsupported),
             candidates,
-            inliers: support,
+            inliers: best_found.map_or(0, |hypothesis| hypothesis.support),
             expected: seen.map(|seen| seen.expected),
             matched: seen.map(|seen| seen.matched),
             expected_cells: seen.map(|seen| seen.expected_cells),
             matched_cells: seen.map(|seen| seen.matched_cells),
+            expected_matches: likeness.expected,
+            found_matches: likeness.matched,
         });
         let mut mapper = joined?;
         report.registrations.append(&mut mapper.records);
@@ -237,13 +251,24 @@ impl<'a> Attempt<'_, '_, 'a> {
                 .map(|candidate| self.refined(&rest, candidate))
                 .map(|candidate| (score(&candidate), candidate))
                 .reduce(|best, next| if next.0 < best.0 { next } else { best });
-            let Some((_, kept_from_moved)) = best else { break };
-            let agreeing = self.sides.agreeing(&rest, &kept_from_moved, bound);
+            let Some((_, mut kept_from_moved)) = best else { break };
+            let mut agreeing = self.sides.agreeing(&rest, &kept_from_moved, bound);
+            let seen = self.seen(&kept_from_moved, &agreeing);
+            if distinct(&agreeing) >= MIN_SEED {
+                for max_angle_rad in GUIDED_BANDS_RAD {
+                    let guide = GuidedParams { max_angle_rad, ..GuidedParams::default() };
+                    let mut all = self.sides.guided(&kept_from_moved, &guide);
+                    all.extend_from_slice(&rest);
+                    let all = once(all);
+                    kept_from_moved = self.refined(&all, kept_from_moved);
+                    agreeing = self.sides.agreeing(&all, &kept_from_moved, bound);
+                }
+            }
             let gone: BTreeSet<_> = agreeing.iter().map(|crossing| (crossing.kept, crossing.moved)).collect();
             rest.retain(|crossing| !gone.contains(&(crossing.kept, crossing.moved)));
-            let seen = self.seen(&kept_from_moved, &agreeing);
             let support = distinct(&agreeing);
-            found.push(Hypothesis { kept_from_moved, agreeing, support, seen });
+            let likeness = self.likeness(&kept_from_moved, &agreeing);
+            found.push(Hypothesis { kept_from_moved, agreeing, support, seen, likeness });
         }
         found
     }
@@ -252,7 +277,7 @@ impl<'a> Attempt<'_, '_, 'a> {
     fn refined(&self, crossings: &[Crossing], initial: Similarity) -> Similarity {
         let bound = self.params.max_error_sigma;
         let mut best = (self.sides.score(crossings, &initial, bound), initial);
-        for widening in [3.0, 1.0, 1.0] {
+        for widening in [6.0, 3.0, 1.0, 1.0] {
             let near = self.sides.agreeing(crossings, &best.1, widening * bound);
             let sights = Sights::collect(&self.sides, near.iter());
             let fitted = sights.refine(&best.1, self.params.loss_sigma);
@@ -292,9 +317,17 @@ impl<'a> Attempt<'_, '_, 'a> {
         [sum(moved, kept, kept_from_moved, &by_moved), sum(kept, moved, &moved_from_kept, &by_kept)]
     }
 
+    fn likeness(&self, kept_from_moved: &Similarity, agreeing: &[Crossing]) -> Likeness {
+        let Sides { kept, moved } = self.sides;
+        let by_moved: Vec<_> = agreeing.iter().filter_map(|c| Some((c.moved.image, c.kept_point?))).collect();
+        let by_kept: Vec<_> = agreeing.iter().filter_map(|c| Some((c.kept.image, c.moved_point?))).collect();
+        likeness(moved, kept, kept_from_moved, &by_moved)
+            + likeness(kept, moved, &kept_from_moved.inverse(), &by_kept)
+    }
+
     fn judge(&self, crossings: &[Crossing], hypothesis: &Hypothesis) -> MergeVerdict {
         let params = self.params;
-        let Hypothesis { kept_from_moved, agreeing, support, seen } = hypothesis;
+        let Hypothesis { kept_from_moved, agreeing, support, seen, likeness } = hypothesis;
         if *support < params.min_registration_inliers {
             return MergeVerdict::Unsupported;
         }
@@ -304,15 +337,17 @@ impl<'a> Attempt<'_, '_, 'a> {
             return MergeVerdict::ScaleOpen;
         }
         let is_judged = |seen: &Visibility| seen.expected >= params.min_visible_points;
-        if seen.iter().any(|seen| is_judged(seen) && !params.is_recognized(seen)) {
-            return MergeVerdict::NotRecognized;
-        }
-        if !seen.iter().any(is_judged) {
+        let is_recognized = if likeness.expected >= MIN_EXPECTED_MATCHES {
+            likeness.matched >= MIN_LIKENESS * likeness.expected
+        } else if seen.iter().any(is_judged) {
+            seen.iter().all(|seen| !is_judged(seen) || params.is_recognized(seen))
+        } else {
             let verified = |of: &[Crossing]| of.iter().filter(|crossing| crossing.verified).count() as f64;
             let confirmed = verified(agreeing) >= params.min_confirmed_share * verified(crossings);
-            if !confirmed || *support < UNJUDGED_SUPPORT * params.min_registration_inliers {
-                return MergeVerdict::NotRecognized;
-            }
+            confirmed && *support >= UNJUDGED_SUPPORT * params.min_registration_inliers
+        };
+        if !is_recognized {
+            return MergeVerdict::NotRecognized;
         }
         if self.pair_agreement(kept_from_moved) < params.min_pair_agreement {
             return MergeVerdict::PairsDisagree;
@@ -438,7 +473,6 @@ impl<'a> Attempt<'_, '_, 'a> {
             complete_and_merge(&mut mapper.model, &mapper.graph, limits);
             mapper.refine(2, 20);
         }
-        eprintln!("DBG held {}", self.holds(&mapper));
         if !self.holds(&mapper) {
             return None;
         }

@@ -7,6 +7,7 @@ use crate::{
     ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint, Rigid,
     Similarity,
     solvers::triangulation::{WorldRay, triangulate},
+    visibility::is_same_view,
 };
 
 /// A registered camera, with its rotation as a matrix because it is applied to every observation.
@@ -293,6 +294,13 @@ impl<'a> Model<'a> {
     pub fn observations_of(&self, image: ImageId) -> Vec<(u32, PointId)> {
         let ids = self.point_of_feature[image.index()].iter().enumerate();
         ids.filter(|&(_, &id)| id != NO_POINT).map(|(feature, &id)| (feature as u32, PointId(id))).collect()
+    }
+
+    /// Number of points that an image sees much as a camera with its centre elsewhere would.
+    pub fn points_seen_alike(&self, image: ImageId, center: &Vector3<f64>) -> usize {
+        let Some(pose) = &self.poses[image.index()] else { return 0 };
+        let points = self.observations_of(image).into_iter().filter_map(|(_, id)| self.point(id));
+        points.filter(|point| is_same_view(&point.position, pose.center(), center)).count()
     }
 
     /// The points that any of these images sees, ascending.

@@ -308,7 +308,6 @@ pub(super) fn visibility_beside(
     for (_, id) in inliers {
         is_inlier[id.index()] = true;
     }
-    let camera = &model.cameras[model.input.images[image.index()].camera.index()];
     let center = world_from_camera.translation;
     let mut counts = Visibility::default();
     let mut cells = vec![(0_usize, 0_usize); direction::CELLS];
@@ -321,12 +320,7 @@ pub(super) fn visibility_beside(
                 continue;
             }
             familiar[id.index()] = true;
-            let direction = world_from_camera.inverse_transform_point(&point.position);
-            let in_image = match model.input.images[image.index()].mosaic {
-                Some(mosaic) => mosaic.covers(&direction),
-                None => in_view(camera, &direction),
-            };
-            if in_image {
+            if is_in_view(model, image, world_from_camera, &point.position) {
                 counts.expected += 1;
                 counts.matched += usize::from(is_inlier[id.index()]);
                 if let Some(cell) = direction::cell(&(point.position - center)) {
@@ -340,6 +334,21 @@ pub(super) fn visibility_beside(
     counts.expected_cells = full().count();
     counts.matched_cells = full().filter(|(_, matched)| *matched > 0).count();
     counts
+}
+
+/// Whether a point falls into an image at this pose.
+pub(super) fn is_in_view(
+    model: &Model<'_>,
+    image: ImageId,
+    world_from_camera: &Rigid,
+    position: &Vector3<f64>,
+) -> bool {
+    let direction = world_from_camera.inverse_transform_point(position);
+    let source = &model.input.images[image.index()];
+    match source.mosaic {
+        Some(mosaic) => mosaic.covers(&direction),
+        None => in_view(&model.cameras[source.camera.index()], &direction),
+    }
 }
 
 /// Registers an image at an accepted pose: its inliers become observations.

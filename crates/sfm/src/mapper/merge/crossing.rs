@@ -1,8 +1,11 @@
 use std::collections::BTreeSet;
 
-use setloc_features::Match;
+use rayon::prelude::*;
+use setloc_features::{GuidedParams, Match, match_guided};
 
-use crate::{ImageId, Observation, PointId, Similarity, mapper::model::Model};
+use crate::{
+    ImageId, Observation, PointId, Similarity, mapper::model::Model, solvers::essential::essential_from_pose,
+};
 
 /// Two components: `moved` is to be put into the frame of `kept`.
 #[derive(Debug, Clone, Copy)]
@@ -22,7 +25,12 @@ pub(super) struct Crossing {
     pub verified: bool,
 }
 
-impl Sides<'_, '_> {
+/// Images of the other component that each is matched with again.
+const MAX_ALIKE: usize = 3;
+/// Fewest points that two images must see alike for that.
+const MIN_ALIKE: usize = 20;
+
+impl<'a> Sides<'_, 'a> {
     /// All matches between the components that say something of the similarity, each once.
     pub fn crossings(&self) -> Vec<Crossing> {
         let input = self.kept.input;
@@ -33,9 +41,7 @@ impl Sides<'_, '_> {
         for pair in input.putative {
             self.collect(pair.first, pair.second, &pair.matches, false, &mut found);
         }
-        found.sort_by_key(|crossing| (crossing.kept, crossing.moved, !crossing.verified));
-        found.dedup_by_key(|crossing| (crossing.kept, crossing.moved));
-        found
+        once(found)
     }
 
     fn collect(
@@ -69,6 +75,62 @@ impl Sides<'_, '_> {
                 found.push(Crossing { kept, moved, kept_point, moved_point, verified });
             }
         }
+    }
+
+    /// Matches along the epipolar circles that a similarity gives the images, of those that see most alike.
+    pub fn guided(&self, kept_from_moved: &Similarity, params: &GuidedParams) -> Vec<Crossing> {
+        let found: Vec<Vec<Crossing>> = self
+            .like_views(kept_from_moved)
+            .into_par_iter()
+            .map(|(kept, moved)| {
+                let mut found = Vec::new();
+                let (Some(of_kept), Some(of_moved)) =
+                    (&self.kept.poses[kept.index()], &self.moved.poses[moved.index()])
+                else {
+                    return found;
+                };
+                let kept_from_image = kept_from_moved.transform_pose(&of_moved.world_from_camera);
+                let moved_from_kept = kept_from_image.inverse() * of_kept.world_from_camera;
+                let features = |model: &Model<'a>, image: ImageId| model.input.images[image.index()].features;
+                let matches = match_guided(
+                    params,
+                    (features(self.kept, kept), &self.kept.rays[kept.index()]),
+                    (features(self.moved, moved), &self.moved.rays[moved.index()]),
+                    &essential_from_pose(&moved_from_kept),
+                );
+                self.collect(kept, moved, &matches, false, &mut found);
+                found
+            })
+            .collect();
+        found.into_iter().flatten().collect()
+    }
+
+    /// Pairs of a kept and a moved image: for each image those few of the other component that see most points much as
+    /// it would.
+    fn like_views(&self, kept_from_moved: &Similarity) -> Vec<(ImageId, ImageId)> {
+        let mut alike: Vec<(ImageId, ImageId)> = Vec::new();
+        let sides = [
+            (self.kept, self.moved, kept_from_moved.inverse(), false),
+            (self.moved, self.kept, *kept_from_moved, true),
+        ];
+        for (of, others, others_from_of, swapped) in sides {
+            for image in of.registered() {
+                let Some(pose) = &of.poses[image.index()] else { continue };
+                let center = others_from_of.transform_point(pose.center());
+                let mut ranked: Vec<(usize, ImageId)> = others
+                    .registered_neighbours(image)
+                    .into_par_iter()
+                    .map(|other| (others.points_seen_alike(other, &center), other))
+                    .filter(|(count, _)| *count >= MIN_ALIKE)
+                    .collect();
+                ranked.sort_by_key(|&(count, other)| (std::cmp::Reverse(count), other));
+                let pair = |other| if swapped { (other, image) } else { (image, other) };
+                alike.extend(ranked.into_iter().take(MAX_ALIKE).map(|(_, other)| pair(other)));
+            }
+        }
+        alike.sort_unstable();
+        alike.dedup();
+        alike
     }
 
     /// Errors of a match under a similarity, in standard deviations: of the moved ray and of the kept one.
@@ -119,6 +181,13 @@ impl BothWays {
     fn new(kept_from_moved: &Similarity) -> Self {
         Self { kept_from_moved: *kept_from_moved, moved_from_kept: kept_from_moved.inverse() }
     }
+}
+
+/// Each match once, as a verified one where it is.
+pub(super) fn once(mut found: Vec<Crossing>) -> Vec<Crossing> {
+    found.sort_by_key(|crossing| (crossing.kept, crossing.moved, !crossing.verified));
+    found.dedup_by_key(|crossing| (crossing.kept, crossing.moved));
+    found
 }
 
 /// How many things in space the matches hold: of all matches between the tracks of two points, one counts.
