@@ -242,7 +242,7 @@ pub struct MapperOutput {
     pub report: MapperReport,
 }
 
-/// Builds all components from verified pairs, largest first.
+/// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///
 /// Images that share no geometry with others are in no component. The frame of a component is its first camera's,
 /// with the first baseline as unit of length, until it is georegistered.

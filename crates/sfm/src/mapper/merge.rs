@@ -81,6 +81,20 @@ pub struct MergeRecord {
     pub found_matches: f64,
 }
 
+impl MergeRecord {
+    /// What was joined and why, in words; `None` when nothing was.
+    pub fn sentence(&self) -> Option<String> {
+        (self.verdict == MergeVerdict::Joined).then(|| {
+            let [larger, smaller] = self.images;
+            format!(
+                "parts of {larger} and {smaller} images were joined: {} matches between them agree on one place, and \
+                 they share {:.0} of the {:.0} views of points that they ought to",
+                self.inliers, self.found_matches, self.expected_matches
+            )
+        })
+    }
+}
+
 /// Fewest matches of a similarity that more are sought for.
 const MIN_SEED: usize = 6;
 /// Half widths of the bands about the epipolar circles in which they are sought, one after the other.

@@ -10,7 +10,10 @@ use rayon::prelude::*;
 
 use crate::{
     ImageId, PointId, Rigid, Similarity,
-    mapper::{model::Model, register::is_in_view},
+    mapper::{
+        model::{Model, ModelPoint},
+        register::is_in_view,
+    },
     visibility::{SAME_VIEW_ANGLE_RAD, SAME_VIEW_DISTANCE_RATIO, is_same_view},
 };
 
@@ -80,9 +83,7 @@ fn own_rates(model: &Model<'_>) -> [f64; BINS] {
             let Some(pose) = &model.poses[image.index()] else { return (expected, seen) };
             for (id, bin) in familiar(model, image, &pose.world_from_camera) {
                 expected[bin] += 1;
-                let sees = |point: &crate::mapper::model::ModelPoint| {
-                    point.track.iter().any(|seen| seen.image == image)
-                };
+                let sees = |point: &ModelPoint| point.track.iter().any(|seen| seen.image == image);
                 seen[bin] += usize::from(model.point(id).is_some_and(sees));
             }
             (expected, seen)
@@ -124,4 +125,20 @@ pub(super) fn likeness(
         })
         .collect();
     counts.into_iter().fold(Likeness::default(), |sum, one| sum + one)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn views_are_the_less_alike_the_farther_apart() {
+        let (point, observer) = (Vector3::new(0.0, 0.0, 10.0), Vector3::zeros());
+        let sideways = |metres: f64| alikeness(&point, &observer, &Vector3::new(metres, 0.0, 0.0));
+        let bins: Vec<_> = [0.0, 1.0, 2.0, 3.0].map(sideways).into_iter().flatten().collect();
+        assert!(bins.len() == 4 && bins.is_sorted() && bins[0] == 0 && bins[3] < BINS, "{bins:?}");
+        assert!(sideways(5.0).is_none());
+        let ahead = |metres: f64| alikeness(&point, &observer, &Vector3::new(0.0, 0.0, metres));
+        assert!(ahead(3.0) > ahead(0.0) && ahead(5.0).is_none());
+    }
 }
