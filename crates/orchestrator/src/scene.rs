@@ -24,13 +24,15 @@ pub struct SceneFile {
     pub origin: Option<Wgs84>,
     /// What the mapper found worth saying.
     pub warnings: Vec<String>,
+    /// What it did that is worth knowing and no reason for doubt.
+    pub notes: Vec<String>,
     /// The configuration it was built with, as TOML: of the stages that a scene depends on.
     pub config: String,
     /// Hash of what localization depends on: the models and the index, not how images are called or what was set.
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 4);
+serde_artifact!(SceneFile, "scene", 5);
 
 impl SceneFile {
     /// Reads a scene file.

@@ -22,8 +22,8 @@ pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, align_t
 pub use geometry::{Rigid, Similarity};
 pub use georegister::{GeoregisterParams, Georegistration, georegister};
 pub use mapper::{
-    InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, Mosaic, PutativePair,
-    RegistrationRecord, reconstruct,
+    InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,
+    MergeVerdict, Mosaic, PutativePair, RegistrationRecord, reconstruct,
 };
 pub use quality::{PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess};
 pub use reconstruction::{

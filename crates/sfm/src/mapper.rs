@@ -4,6 +4,7 @@ mod adjust;
 mod correspondence;
 mod direction;
 mod initial;
+mod merge;
 mod model;
 mod register;
 mod standpoint;
@@ -17,7 +18,10 @@ use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, ImageFeatures, Match};
 
 pub(crate) use self::adjust::MIN_ADJUSTABLE_POINTS;
-pub use self::standpoint::Mosaic;
+pub use self::{
+    merge::{MergeRecord, MergeVerdict},
+    standpoint::Mosaic,
+};
 
 use self::{
     adjust::{Scope, adjust, is_adjustable},
@@ -37,7 +41,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 7;
+pub const MAPPER_VERSION: u32 = 8;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -122,6 +126,10 @@ impl MapperParams {
 
     fn bundle(&self, max_iterations: u32) -> BundleParams {
         BundleParams { loss: RobustLoss::Cauchy(self.loss_sigma), max_iterations, ..BundleParams::default() }
+    }
+
+    fn is_recognized(&self, seen: &Visibility) -> bool {
+        seen.recall() >= self.min_visibility_recall || seen.coverage() >= self.min_visibility_coverage
     }
 
     fn ransac(&self) -> RansacParams {
@@ -217,6 +225,8 @@ impl RegistrationRecord {
 pub struct MapperReport {
     /// Registrations in the order tried.
     pub registrations: Vec<RegistrationRecord>,
+    /// Attempts to join components in the order tried.
+    pub merges: Vec<MergeRecord>,
     /// How the largest component lies in the measured frame, when positions were given and fix it.
     pub georegistration: Option<Georegistration>,
     /// Things that disagree, in words.
@@ -232,7 +242,7 @@ pub struct MapperOutput {
     pub report: MapperReport,
 }
 
-/// Builds all components from verified pairs, largest first.
+/// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///
 /// Images that share no geometry with others are in no component. The frame of a component is its first camera's,
 /// with the first baseline as unit of length, until it is georegistered.
@@ -244,7 +254,8 @@ pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) ->
 }
 
 fn reconstruct_images(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
-    let mut output = MapperOutput::default();
+    let mut report = MapperReport::default();
+    let mut parts: Vec<Part> = Vec::new();
     let mut taken = vec![false; input.images.len()];
     while let Some(mut mapper) = Mapper::new(params, input, taken.clone(), seed) {
         let found = mapper.initialize();
@@ -252,17 +263,31 @@ fn reconstruct_images(params: &MapperParams, input: &MapperInput<'_>, seed: u64)
             mapper.grow();
             mapper.finish();
         }
-        output.report.registrations.append(&mut mapper.records);
+        report.registrations.append(&mut mapper.records);
         if !found || mapper.model.registered_count() < 2 {
             break;
         }
         for image in mapper.model.registered() {
             taken[image.index()] = true;
         }
-        output.components.push(mapper.model.into_reconstruction());
+        parts.push(mapper.into_part());
     }
-    output.components.sort_by_key(|component| std::cmp::Reverse(component.registered().count()));
-    output
+    let parts = merge::join_supported(params, input, parts, &mut report, seed);
+    MapperOutput { components: parts.into_iter().map(|part| part.component).collect(), report }
+}
+
+/// The image that each image was turned from, and the turn, where it entered so.
+type Anchors = Vec<Option<(ImageId, UnitQuaternion<f64>)>>;
+
+/// A finished component with what its images are held by.
+struct Part {
+    component: Reconstruction,
+    anchors: Anchors,
+}
+
+/// The pairs of which no image is taken.
+fn enabled_pairs(input: &MapperInput<'_>, taken: &[bool]) -> Vec<bool> {
+    input.pairs.iter().map(|pair| !taken[pair.first.index()] && !taken[pair.second.index()]).collect()
 }
 
 struct Mapper<'a> {
@@ -272,8 +297,7 @@ struct Mapper<'a> {
     enabled: Vec<bool>,
     /// Images of earlier components.
     taken: Vec<bool>,
-    /// The image that an image was turned from, and the turn.
-    anchors: Vec<Option<(ImageId, UnitQuaternion<f64>)>>,
+    anchors: Anchors,
     /// 2D-to-3D matches that an image had when it was last refused.
     refused_at: Vec<usize>,
     /// Points that a registered image had when the baseline of a pair (by index) was last sought.
@@ -290,28 +314,32 @@ impl<'a> Mapper<'a> {
         taken: Vec<bool>,
         seed: u64,
     ) -> Option<Self> {
-        let enabled: Vec<bool> = input
-            .pairs
-            .iter()
-            .map(|pair| !taken[pair.first.index()] && !taken[pair.second.index()])
-            .collect();
-        if !enabled.contains(&true) {
-            return None;
-        }
+        let has_work = enabled_pairs(input, &taken).contains(&true);
+        has_work.then(|| Self::over(params, Model::new(input), taken, seed))
+    }
+
+    /// Works on a model from images that are not taken.
+    fn over(params: &'a MapperParams, model: Model<'a>, taken: Vec<bool>, seed: u64) -> Self {
+        let input = model.input;
+        let enabled = enabled_pairs(input, &taken);
         let counts: Vec<usize> = input.images.iter().map(|image| image.features.len()).collect();
-        Some(Self {
+        Self {
             params,
-            model: Model::new(input),
             graph: CorrespondenceGraph::build(&counts, input.pairs, &enabled),
+            images_at_last_global: model.registered_count().max(2),
+            model,
             enabled,
             taken,
             anchors: vec![None; input.images.len()],
             refused_at: vec![0; input.images.len()],
             baseline_tried: BTreeMap::new(),
             records: Vec::new(),
-            images_at_last_global: 2,
             seed,
-        })
+        }
+    }
+
+    fn into_part(self) -> Part {
+        Part { component: self.model.into_reconstruction(), anchors: self.anchors }
     }
 
     fn initialize(&mut self) -> bool {
@@ -529,7 +557,7 @@ impl<'a> Mapper<'a> {
             let seen = hypothesis.visibility;
             let judged = seen.expected >= self.params.min_visible_points;
             // Where a better supported pose was refused for what it does not see, this one needs evidence of its own.
-            let plausible = if judged { self.is_recognized(&seen) } else { !refused_before };
+            let plausible = if judged { self.params.is_recognized(&seen) } else { !refused_before };
             refused_before |= !plausible;
             let accepted = plausible
                 && self.pair_agreement(image, &hypothesis.world_from_camera)
@@ -541,11 +569,6 @@ impl<'a> Mapper<'a> {
             }
         }
         None
-    }
-
-    fn is_recognized(&self, seen: &Visibility) -> bool {
-        seen.recall() >= self.params.min_visibility_recall
-            || seen.coverage() >= self.params.min_visibility_coverage
     }
 
     /// Share of an image's verified matches to registered images that belong to pairs whose rotation agrees with a pose.
@@ -596,7 +619,7 @@ impl<'a> Mapper<'a> {
             let pose = self.model.poses[image.index()]?.world_from_camera;
             let seen = visibility(&self.model, image, &pose, &self.model.observations_of(image));
             let judged = seen.expected >= self.params.min_visible_points;
-            (judged && !self.is_recognized(&seen)).then_some((at, seen))
+            (judged && !self.params.is_recognized(&seen)).then_some((at, seen))
         };
         images.par_iter().enumerate().find_map_first(misplaced)
     }

@@ -7,7 +7,7 @@
 mod absolute_pose;
 mod absolute_pose_focal;
 mod generalized_pose;
-mod least_squares;
+pub(crate) mod least_squares;
 mod ransac;
 mod ray_homography;
 mod relative_pose;

@@ -1,9 +1,9 @@
 use nalgebra::Vector3;
 
 /// Largest angle at the point between two views of it that a descriptor surely survives.
-const SAME_VIEW_ANGLE_RAD: f64 = 0.35;
+pub(crate) const SAME_VIEW_ANGLE_RAD: f64 = 0.35;
 /// Largest ratio of distances to the point that a descriptor surely survives.
-const SAME_VIEW_DISTANCE_RATIO: f64 = 1.5;
+pub(crate) const SAME_VIEW_DISTANCE_RATIO: f64 = 1.5;
 
 /// Whether a camera at `candidate` sees `point` much as a camera at `observer` does.
 ///

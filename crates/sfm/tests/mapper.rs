@@ -3,10 +3,10 @@
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{Camera, CameraModel, ImageFeatures, Keypoint, Match};
+use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
 use setloc_sfm::{
-    CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, PairGeometry, Rigid, Similarity,
-    TwoViewParams, reconstruct, verify_pair,
+    CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, MergeVerdict, PairGeometry,
+    PutativePair, Rigid, Similarity, TwoViewParams, reconstruct, verify_pair,
 };
 
 /// A street of points seen by cameras, with matches between all images that see a point.
@@ -263,6 +263,149 @@ fn two_streets_without_a_common_view_are_two_components() {
     let sizes: Vec<usize> =
         output.components.iter().map(|component| component.registered().count()).collect();
     assert_eq!(sizes, [5, 5]);
+}
+
+/// What of a street's matches crosses from its first images to the others.
+#[derive(Clone, Copy)]
+enum Across {
+    /// So few of each pair that none can be verified.
+    Few(usize),
+    /// As few, all wrong.
+    Wrong(usize),
+    /// All.
+    All,
+}
+
+impl Street {
+    /// Gives keypoints that look alike equal descriptors.
+    fn describe(&mut self) {
+        for (features, points) in self.features.iter_mut().zip(&self.point_of) {
+            for &point in points {
+                let mut rng = ChaCha8Rng::seed_from_u64(self.look[point] as u64);
+                features.descriptors.extend((0..DESCRIPTOR_LEN).map(|_| rng.random_range(0..=78_u8)));
+            }
+        }
+    }
+
+    /// Maps the street with `split` as the first image of the second half; `jump_m` is added to where the second half
+    /// was measured along the street.
+    fn map_halves(&self, split: usize, across: Across, jump_m: Option<f64>) -> MapperOutput {
+        let mut rng = ChaCha8Rng::seed_from_u64(17);
+        let rays: Vec<_> =
+            self.features.iter().zip(&self.cameras).map(|(features, camera)| features.rays(camera)).collect();
+        let (mut pairs, mut putative) = (Vec::new(), Vec::new());
+        for a in 0..self.features.len() {
+            for b in a + 1..self.features.len() {
+                let mut matches = self.matches(a, b, &mut rng);
+                if (a < split) != (b < split) {
+                    let count = match across {
+                        Across::Few(count) | Across::Wrong(count) => count,
+                        Across::All => matches.len(),
+                    };
+                    let step = matches.len().div_ceil(count.max(1)).max(1);
+                    matches = matches.into_iter().step_by(step).collect();
+                    if matches!(across, Across::Wrong(_)) {
+                        for m in &mut matches {
+                            m.second = rng.random_range(0..self.point_of[b].len()) as u32;
+                        }
+                    }
+                }
+                let (first, second) = (ImageId(a as u32), ImageId(b as u32));
+                let params = TwoViewParams::default();
+                for two_view in verify_pair(&params, &rays[a], &rays[b], &matches, (a * 100 + b) as u64) {
+                    pairs.push(PairGeometry { first, second, two_view });
+                }
+                putative.push(PutativePair { first, second, matches });
+            }
+        }
+        let measured = |index: usize| {
+            let jump = if index < split { 0.0 } else { jump_m? };
+            Some(self.truth[index].translation + Vector3::new(0.0, 0.0, jump + 3.0 * (index % 2) as f64))
+        };
+        let images = (0..self.features.len()).map(|index| InputImage {
+            name: &self.names[index],
+            camera: CameraId(index as u32),
+            features: &self.features[index],
+            position_prior: jump_m.and_then(|_| measured(index)),
+            mosaic: None,
+        });
+        let input = MapperInput {
+            camera_fixed: vec![true; self.cameras.len()],
+            cameras: self.cameras.clone(),
+            images: images.collect(),
+            pairs: &pairs,
+            putative: &putative,
+            two_view: TwoViewParams::default(),
+        };
+        reconstruct(&MapperParams::default(), &input, 5)
+    }
+}
+
+fn sizes(output: &MapperOutput) -> Vec<usize> {
+    output.components.iter().map(|component| component.registered().count()).collect()
+}
+
+fn verdicts(output: &MapperOutput) -> Vec<MergeVerdict> {
+    output.report.merges.iter().map(|record| record.verdict).collect()
+}
+
+#[test]
+fn two_halves_that_only_few_matches_tie_become_one() {
+    let mut street = Street::of_panoramas(10, 0.3, 0, 21);
+    street.describe();
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| street.map_halves(5, Across::Few(12), None))
+    };
+    let output = on(2);
+    assert_eq!(verdicts(&output), [MergeVerdict::Joined], "{:?}", output.report.merges);
+    assert_eq!(sizes(&output), [10]);
+    let (_, worst_m, worst_deg) = street.errors(&output);
+    assert!(worst_m < 0.02 && worst_deg < 0.02, "{worst_m} m {worst_deg} deg");
+    assert_eq!(output, on(1));
+}
+
+#[test]
+fn wrong_matches_join_nothing() {
+    let mut street = Street::of_panoramas(10, 0.3, 0, 22);
+    street.describe();
+    let output = street.map_halves(5, Across::Wrong(18), None);
+    assert_eq!(verdicts(&output), [MergeVerdict::Unsupported]);
+    assert_eq!(sizes(&output), [5, 5]);
+}
+
+#[test]
+fn measured_positions_may_forbid_to_join() {
+    let mut street = Street::of_panoramas(10, 0.3, 0, 23);
+    street.describe();
+    let right = street.map_halves(5, Across::Few(12), Some(0.0));
+    assert_eq!((verdicts(&right), sizes(&right)), (vec![MergeVerdict::Joined], vec![10]));
+    let wrong = street.map_halves(5, Across::Few(12), Some(60.0));
+    assert_eq!((verdicts(&wrong), sizes(&wrong)), (vec![MergeVerdict::PositionsDisagree], vec![5, 5]));
+}
+
+#[test]
+fn a_facade_that_stands_in_two_streets_does_not_join_them() {
+    // Panoramas at 0–20 m and 45–65 m of one street, of which the second half sees everything but the façade anew.
+    let mut street = Street::of_panoramas(14, 0.3, 60, 24);
+    let modules = street.look.iter().enumerate().filter(|(at, look)| **look != *at).map(|(at, _)| at);
+    let modules: Vec<usize> = modules.flat_map(|at| [street.look[at], at]).collect();
+    let points = street.look.len();
+    street.look.extend(points..2 * points);
+    for image in 9..14 {
+        for point in street.point_of[image].iter_mut().filter(|point| !modules.contains(point)) {
+            *point += points;
+        }
+    }
+    for image in 5..9 {
+        street.point_of[image].clear();
+        street.features[image].keypoints.clear();
+        street.features[image].colors.clear();
+    }
+    street.describe();
+    let output = street.map_halves(9, Across::All, None);
+    assert_eq!(sizes(&output), [5, 5], "{:?}", output.report.registrations);
+    assert_eq!(verdicts(&output), [MergeVerdict::NotRecognized], "{:?}", output.report.merges);
 }
 
 #[test]

@@ -155,6 +155,7 @@ fn write_report(folder: &Path, built: &Built, session: &Session) -> Result<()> {
     report["scene"] = serde_json::json!(built.hash);
     report["skipped"] = serde_json::json!(built.skipped);
     report["warnings"] = serde_json::json!(built.scene.warnings);
+    report["notes"] = serde_json::json!(built.scene.notes);
     write_json(&folder.join("report.json"), &report)
 }
 
@@ -174,6 +175,9 @@ pub fn summarize(scene: &SceneFile, images: usize) {
             model.observation_count()
         )),
         None => print::note(&format!("scene: 0/{images} images could be registered")),
+    }
+    for note in &scene.notes {
+        print::note(&format!("note: {note}"));
     }
     for warning in &scene.warnings {
         print::note(&format!("warning: {warning}"));

@@ -30,6 +30,7 @@ pub fn scene_json(scene: &SceneFile) -> Value {
     json!({
         "convention": "X_world = R(q) X_camera + center; camera x right, y down, z forward; pixel (0.5, 0.5) is the first pixel's centre",
         "geo_origin": scene.origin, "components": components, "warnings": scene.warnings,
+        "notes": scene.notes,
     })
 }
 

@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 use serde_json::json;
 use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::{MapperOutput, Reconstruction};
+use setloc_sfm::{MapperOutput, MergeRecord, Reconstruction};
 
 use super::choose_pairs;
 use super::model::{ModelKind, ModelSource, add_model, image_of_place_holder, with_names};
@@ -81,6 +81,7 @@ pub fn add_scene(
             index: (*index).clone(),
             origin: output.report.georegistration.as_ref().and(origin),
             warnings: output.report.warnings.iter().map(|text| with_names(text, &names)).collect(),
+            notes: output.report.merges.iter().filter_map(MergeRecord::sentence).collect(),
             config: config.clone(),
             content: ContentHash::of_all(&[inputs.hash("model")?, inputs.hash("index")?]),
         })

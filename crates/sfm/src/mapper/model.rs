@@ -2,10 +2,12 @@ use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use setloc_features::{Camera, Rays};
 
-use super::MapperInput;
+use super::{InputImage, MapperInput};
 use crate::{
     ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint, Rigid,
+    Similarity,
     solvers::triangulation::{WorldRay, triangulate},
+    visibility::is_same_view,
 };
 
 /// A registered camera, with its rotation as a matrix because it is applied to every observation.
@@ -51,14 +53,61 @@ const NO_POINT: u32 = u32::MAX;
 
 impl<'a> Model<'a> {
     pub fn new(input: &'a MapperInput<'a>) -> Self {
-        let rays = input
-            .images
-            .par_iter()
-            .map(|image| image.features.rays(&input.cameras[image.camera.index()]))
-            .collect();
+        Self::with_cameras(input, input.cameras.clone(), |_| true)
+    }
+
+    /// The model of a finished component; the places of its points are their ids. Images outside have no rays.
+    pub fn of_component(input: &'a MapperInput<'a>, component: &Reconstruction) -> Self {
+        let is_inside = |image: usize| component.images[image].world_from_camera.is_some();
+        let mut model = Self::with_cameras(input, component.cameras.clone(), is_inside);
+        model.take_in(component, &Similarity::identity());
+        model
+    }
+
+    /// The model of two components, the points of `moved` after those of `kept`.
+    ///
+    /// Intrinsics that were found in both are those of `kept`.
+    pub fn of_components(
+        input: &'a MapperInput<'a>,
+        kept: &Reconstruction,
+        moved: &Reconstruction,
+        kept_from_moved: &Similarity,
+    ) -> Self {
+        let mut cameras = moved.cameras.clone();
+        for image in kept.registered() {
+            let camera = input.images[image.index()].camera.index();
+            cameras[camera] = kept.cameras[camera].clone();
+        }
+        let mut model = Self::with_cameras(input, cameras, |_| true);
+        model.take_in(kept, &Similarity::identity());
+        model.take_in(moved, kept_from_moved);
+        model
+    }
+
+    fn take_in(&mut self, component: &Reconstruction, world_from_component: &Similarity) {
+        for (index, image) in component.images.iter().enumerate() {
+            if let Some(pose) = &image.world_from_camera {
+                self.set_pose(ImageId(index as u32), Some(world_from_component.transform_pose(pose)));
+            }
+        }
+        for point in &component.points {
+            self.add_point(world_from_component.transform_point(&point.position), point.track.clone());
+        }
+    }
+
+    fn with_cameras(
+        input: &'a MapperInput<'a>,
+        cameras: Vec<Camera>,
+        has_rays: impl Fn(usize) -> bool + Sync,
+    ) -> Self {
+        let rays_of = |(index, image): (usize, &InputImage<'_>)| {
+            let camera = &cameras[image.camera.index()];
+            if has_rays(index) { image.features.rays(camera) } else { Rays::default() }
+        };
+        let rays = input.images.par_iter().enumerate().map(rays_of).collect();
         Self {
             input,
-            cameras: input.cameras.clone(),
+            cameras,
             rays,
             poses: vec![None; input.images.len()],
             points: Vec::new(),
@@ -245,6 +294,13 @@ impl<'a> Model<'a> {
     pub fn observations_of(&self, image: ImageId) -> Vec<(u32, PointId)> {
         let ids = self.point_of_feature[image.index()].iter().enumerate();
         ids.filter(|&(_, &id)| id != NO_POINT).map(|(feature, &id)| (feature as u32, PointId(id))).collect()
+    }
+
+    /// Number of points that an image sees much as a camera with its centre elsewhere would.
+    pub fn points_seen_alike(&self, image: ImageId, center: &Vector3<f64>) -> usize {
+        let Some(pose) = &self.poses[image.index()] else { return 0 };
+        let points = self.observations_of(image).into_iter().filter_map(|(_, id)| self.point(id));
+        points.filter(|point| is_same_view(&point.position, pose.center(), center)).count()
     }
 
     /// The points that any of these images sees, ascending.

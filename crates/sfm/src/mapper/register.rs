@@ -49,6 +49,18 @@ impl Visibility {
     }
 }
 
+impl std::iter::Sum for Visibility {
+    /// What several images see in common.
+    fn sum<I: Iterator<Item = Self>>(all: I) -> Self {
+        all.fold(Self::default(), |sum, one| Self {
+            expected: sum.expected + one.expected,
+            matched: sum.matched + one.matched,
+            expected_cells: sum.expected_cells + one.expected_cells,
+            matched_cells: sum.matched_cells + one.matched_cells,
+        })
+    }
+}
+
 /// Number of 2D-to-3D matches that [`scene_matches`] would find.
 pub(super) fn count_scene_matches(model: &Model<'_>, graph: &CorrespondenceGraph, image: ImageId) -> usize {
     // Most images wait far from the model.
@@ -281,16 +293,26 @@ pub(super) fn visibility(
     world_from_camera: &Rigid,
     inliers: &[(u32, PointId)],
 ) -> Visibility {
+    visibility_beside(model, image, world_from_camera, inliers, &model.registered_neighbours(image))
+}
+
+/// [`visibility`] of what these registered images see.
+pub(super) fn visibility_beside(
+    model: &Model<'_>,
+    image: ImageId,
+    world_from_camera: &Rigid,
+    inliers: &[(u32, PointId)],
+    others: &[ImageId],
+) -> Visibility {
     let mut is_inlier = vec![false; model.points.len()];
     for (_, id) in inliers {
         is_inlier[id.index()] = true;
     }
-    let camera = &model.cameras[model.input.images[image.index()].camera.index()];
     let center = world_from_camera.translation;
     let mut counts = Visibility::default();
     let mut cells = vec![(0_usize, 0_usize); direction::CELLS];
     let mut familiar = vec![false; model.points.len()];
-    for other in model.registered_neighbours(image) {
+    for &other in others {
         let Some(pose) = &model.poses[other.index()] else { continue };
         for (_, id) in model.observations_of(other) {
             let Some(point) = model.point(id).filter(|_| !familiar[id.index()]) else { continue };
@@ -298,12 +320,7 @@ pub(super) fn visibility(
                 continue;
             }
             familiar[id.index()] = true;
-            let direction = world_from_camera.inverse_transform_point(&point.position);
-            let in_image = match model.input.images[image.index()].mosaic {
-                Some(mosaic) => mosaic.covers(&direction),
-                None => in_view(camera, &direction),
-            };
-            if in_image {
+            if is_in_view(model, image, world_from_camera, &point.position) {
                 counts.expected += 1;
                 counts.matched += usize::from(is_inlier[id.index()]);
                 if let Some(cell) = direction::cell(&(point.position - center)) {
@@ -317,6 +334,21 @@ pub(super) fn visibility(
     counts.expected_cells = full().count();
     counts.matched_cells = full().filter(|(_, matched)| *matched > 0).count();
     counts
+}
+
+/// Whether a point falls into an image at this pose.
+pub(super) fn is_in_view(
+    model: &Model<'_>,
+    image: ImageId,
+    world_from_camera: &Rigid,
+    position: &Vector3<f64>,
+) -> bool {
+    let direction = world_from_camera.inverse_transform_point(position);
+    let source = &model.input.images[image.index()];
+    match source.mosaic {
+        Some(mosaic) => mosaic.covers(&direction),
+        None => in_view(&model.cameras[source.camera.index()], &direction),
+    }
 }
 
 /// Registers an image at an accepted pose: its inliers become observations.

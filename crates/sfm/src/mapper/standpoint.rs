@@ -125,6 +125,11 @@ impl<'a> Standpoints<'a> {
         for record in &mut output.report.registrations {
             record.image = self.mosaics[record.image.index()].members[0].image;
         }
+        for record in &mut output.report.merges {
+            for first in &mut record.first_images {
+                *first = self.mosaics[first.index()].members[0].image;
+            }
+        }
         output.components =
             output.components.into_iter().map(|component| self.expand_component(component)).collect();
         output.components.sort_by_key(|component| std::cmp::Reverse(component.registered().count()));

@@ -169,6 +169,16 @@ pub(super) fn complete_and_merge(
     changes
 }
 
+/// Makes matched keypoints observations of one point, where one of them is and the limits allow it.
+pub(super) fn connect(model: &mut Model<'_>, limits: PointLimits, a: Observation, b: Observation) -> bool {
+    match (model.point_of(a), model.point_of(b)) {
+        (Some(of_a), Some(of_b)) => of_a != of_b && merge(model, limits, of_a, of_b),
+        (Some(id), None) => complete(model, limits, id, b),
+        (None, Some(id)) => complete(model, limits, id, a),
+        (None, None) => false,
+    }
+}
+
 fn complete(model: &mut Model<'_>, limits: PointLimits, id: PointId, partner: Observation) -> bool {
     let Some(point) = model.point(id) else { return false };
     let agrees = !sees(&point.track, partner.image)

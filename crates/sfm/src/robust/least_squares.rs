@@ -1,7 +1,7 @@
 use nalgebra::{Const, DimMin, SMatrix, SVector};
 
 /// A robust nonlinear least-squares problem of `D` parameters over independent terms.
-pub(super) trait LeastSquares<const D: usize> {
+pub(crate) trait LeastSquares<const D: usize> {
     /// What is estimated.
     type Model: Copy;
 
@@ -16,9 +16,9 @@ pub(super) trait LeastSquares<const D: usize> {
 }
 
 /// Normal equations JᵀJ·δ = −Jᵀr.
-pub(super) struct Normal<const D: usize> {
-    pub(super) matrix: SMatrix<f64, D, D>,
-    pub(super) gradient: SVector<f64, D>,
+pub(crate) struct Normal<const D: usize> {
+    pub(crate) matrix: SMatrix<f64, D, D>,
+    pub(crate) gradient: SVector<f64, D>,
 }
 
 impl<const D: usize> Normal<D> {
@@ -28,7 +28,7 @@ impl<const D: usize> Normal<D> {
 
     /// Adds one scalar residual with derivative `row` (1×D); only the lower triangle is kept.
     #[inline(always)]
-    pub(super) fn add(&mut self, value: f64, row: &SVector<f64, D>, weight: f64) {
+    pub(crate) fn add(&mut self, value: f64, row: &SVector<f64, D>, weight: f64) {
         for j in 0..D {
             let weighted = row[j] * weight;
             self.gradient[j] += weighted * value;
@@ -41,13 +41,13 @@ impl<const D: usize> Normal<D> {
 
 /// Cauchy loss c²·ln(1 + r²/c²) of a squared residual, and its weight.
 #[inline(always)]
-pub(super) fn cauchy(squared: f64, inverse_scale_squared: f64) -> (f64, f64) {
+pub(crate) fn cauchy(squared: f64, inverse_scale_squared: f64) -> (f64, f64) {
     let ratio = squared * inverse_scale_squared;
     (ratio.ln_1p() / inverse_scale_squared, 1.0 / (1.0 + ratio))
 }
 
 /// Levenberg–Marquardt with Marquardt's diagonal damping; never returns a model of higher cost.
-pub(super) fn minimize<const D: usize, P: LeastSquares<D>>(
+pub(crate) fn minimize<const D: usize, P: LeastSquares<D>>(
     problem: &P,
     initial: P::Model,
     max_steps: usize,

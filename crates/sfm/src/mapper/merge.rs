@@ -1,0 +1,540 @@
+//! Components that are parts of one place, joined.
+//!
+//! Images that none of the others could be resected to one by one start a component of their own. Together they know
+//! more: the rays of all of them to the other component's points, and the points of both, determine rotation,
+//! translation and scale between the two as those of a camera set to a scene (a generalized camera; J. Ventura,
+//! C. Arth, G. Reitmayr, D. Schmalstieg, "A minimal solution to the generalized pose-and-scale problem", CVPR 2014).
+//! Two places that share a façade are joined by perfect matches, too, and a folded model is worse than two halves, so
+//! what stands against single images in the wrong place is asked of the whole component, before and after everything
+//! has been adjusted together.
+
+mod crossing;
+mod likeness;
+mod similarity;
+
+use std::collections::BTreeSet;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use setloc_features::GuidedParams;
+
+use self::{
+    crossing::{Crossing, Sides, distinct, once},
+    likeness::{Likeness, likeness},
+    similarity::Sights,
+};
+use super::{
+    Mapper, MapperInput, MapperParams, MapperReport, Part,
+    model::Model,
+    register::{Visibility, visibility, visibility_beside},
+    structure::{complete_and_merge, connect},
+};
+use crate::{ImageId, PointId, Similarity, robust::RansacParams};
+
+/// What became of two components that matches cross.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum MergeVerdict {
+    /// They are one now.
+    Joined,
+    /// Too few matches agree on a similarity.
+    Unsupported,
+    /// The matches that agree leave the scale open.
+    ScaleOpen,
+    /// Too little was matched of what either ought to see of the other.
+    NotRecognized,
+    /// The rotations of verified pairs disagree.
+    PairsDisagree,
+    /// The measured positions disagree.
+    PositionsDisagree,
+    /// Two different similarities are as good.
+    Ambiguous,
+    /// The adjustment of both together contradicts it.
+    Contradicted,
+}
+
+/// An attempt to join two components.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MergeRecord {
+    /// The first image of each component, the larger one first.
+    pub first_images: [ImageId; 2],
+    /// Images of each.
+    pub images: [usize; 2],
+    /// What became of it.
+    pub verdict: MergeVerdict,
+    /// Matches between them, of which at least one keypoint carries a point; those of one point with one other count
+    /// once.
+    pub candidates: usize,
+    /// Those that agree with the best similarity.
+    pub inliers: usize,
+    /// Points of the larger component in plain view of the smaller one's images, and of the smaller in that of the
+    /// larger one's.
+    pub expected: [usize; 2],
+    /// Those of them that were matched.
+    pub matched: [usize; 2],
+    /// Directions with points in plain view, over all images.
+    pub expected_cells: [usize; 2],
+    /// Directions among them in which any was matched.
+    pub matched_cells: [usize; 2],
+    /// Matches that there would be if the images matched the other component as they match their own.
+    pub expected_matches: f64,
+    /// Those that there are, of all that could be found.
+    pub found_matches: f64,
+}
+
+impl MergeRecord {
+    /// What was joined and why, in words; `None` when nothing was.
+    pub fn sentence(&self) -> Option<String> {
+        (self.verdict == MergeVerdict::Joined).then(|| {
+            let [larger, smaller] = self.images;
+            format!(
+                "parts of {larger} and {smaller} images were joined: {} matches between them agree on one place, and \
+                 they share {:.0} of the {:.0} views of points that they ought to",
+                self.inliers, self.found_matches, self.expected_matches
+            )
+        })
+    }
+}
+
+/// Fewest matches of a similarity that more are sought for.
+const MIN_SEED: usize = 6;
+/// Half widths of the bands about the epipolar circles in which they are sought, one after the other.
+const GUIDED_BANDS_RAD: [f64; 3] = [0.02, 0.008, 0.004];
+/// Matches of an image that make it count for the scale between two components: one more than its pose needs.
+const IMAGE_MATCHES: usize = 4;
+/// Largest standard deviation of the logarithm of the scale between two components.
+const MAX_LOG_SCALE_SIGMA: f64 = 0.05;
+/// Fewest matches that likeness must expect to judge by it.
+const MIN_EXPECTED_MATCHES: f64 = 10.0;
+/// Smallest share of the matches expected by likeness.
+const MIN_LIKENESS: f64 = 0.3;
+/// How many times more matches must agree when too little is in plain view to be judged by.
+const UNJUDGED_SUPPORT: usize = 2;
+/// Two similarities that differ by less than this share of the distance to what is seen are one.
+const SAME_PLACE: f64 = 0.2;
+/// Error of measured positions that proves nothing, in metres.
+const MAX_POSITION_ERROR_M: f64 = 15.0;
+/// The same as a share of the measured distance.
+const MAX_POSITION_ERROR_SHARE: f64 = 0.3;
+/// Smallest share of each component's own observations that the adjustment of both together must keep.
+const MIN_KEPT_OBSERVATIONS: f64 = 0.9;
+
+/// Joins components, largest first, as long as a similarity between two of them is supported. Returns them by size.
+pub(super) fn join_supported(
+    params: &MapperParams,
+    input: &MapperInput<'_>,
+    mut parts: Vec<Part>,
+    report: &mut MapperReport,
+    seed: u64,
+) -> Vec<Part> {
+    let mut tried = BTreeSet::new();
+    loop {
+        parts.sort_by_key(|part| std::cmp::Reverse(part.size()));
+        let Some((kept, moved, joined)) = first_joined(params, input, &parts, &mut tried, report, seed)
+        else {
+            return parts;
+        };
+        parts[kept] = joined;
+        parts.remove(moved);
+    }
+}
+
+/// What tells a part from all others and from itself before it grew: its first image and its size.
+type PartState = (Option<ImageId>, usize);
+
+fn first_joined(
+    params: &MapperParams,
+    input: &MapperInput<'_>,
+    parts: &[Part],
+    tried: &mut BTreeSet<[PartState; 2]>,
+    report: &mut MapperReport,
+    seed: u64,
+) -> Option<(usize, usize, Part)> {
+    for (kept, larger) in parts.iter().enumerate() {
+        for (moved, smaller) in parts.iter().enumerate().skip(kept + 1) {
+            if !tried.insert([larger.state(), smaller.state()]) {
+                continue;
+            }
+            let mut taken = vec![false; input.images.len()];
+            for (_, other) in parts.iter().enumerate().filter(|(at, _)| *at != kept && *at != moved) {
+                for image in other.component.registered() {
+                    taken[image.index()] = true;
+                }
+            }
+            let sides = Sides {
+                kept: &Model::of_component(input, &larger.component),
+                moved: &Model::of_component(input, &smaller.component),
+            };
+            let attempt = Attempt { params, kept: larger, moved: smaller, sides, seed };
+            if let Some(joined) = attempt.run(taken, report) {
+                return Some((kept, moved, joined));
+            }
+        }
+    }
+    None
+}
+
+impl Part {
+    fn size(&self) -> usize {
+        self.component.registered().count()
+    }
+
+    fn state(&self) -> PartState {
+        (self.component.registered().next(), self.size())
+    }
+}
+
+/// A similarity between two components with the evidence for it.
+struct Hypothesis {
+    kept_from_moved: Similarity,
+    agreeing: Vec<Crossing>,
+    support: usize,
+    /// What the moved images see of the kept points, and the kept images of the moved points.
+    seen: [Visibility; 2],
+    /// What either matches of the other, measured by what each matches of itself; further matches included.
+    likeness: Likeness,
+}
+
+struct Attempt<'p, 'm, 'a> {
+    params: &'a MapperParams,
+    kept: &'p Part,
+    moved: &'p Part,
+    sides: Sides<'m, 'a>,
+    seed: u64,
+}
+
+impl<'a> Attempt<'_, '_, 'a> {
+    fn run(&self, taken: Vec<bool>, report: &mut MapperReport) -> Option<Part> {
+        let crossings = self.sides.crossings();
+        let candidates = distinct(&crossings);
+        if candidates < self.params.min_registration_inliers {
+            return None;
+        }
+        let hypotheses = self.hypotheses(&crossings);
+        let mut verdicts: Vec<MergeVerdict> =
+            hypotheses.iter().map(|hypothesis| self.judge(&crossings, hypothesis)).collect();
+        let mut fit = verdicts.iter().enumerate().filter(|(_, verdict)| **verdict == MergeVerdict::Joined);
+        let first = fit.next().map(|(at, _)| at);
+        let rival =
+            fit.any(|(at, _)| first.is_some_and(|first| self.differ(&hypotheses[first], &hypotheses[at])));
+        let mut joined = None;
+        let best = first.unwrap_or(0);
+        if first.is_some() {
+            joined = if rival { None } else { self.join(&hypotheses[best], taken) };
+            if joined.is_none() {
+                verdicts[best] = if rival { MergeVerdict::Ambiguous } else { MergeVerdict::Contradicted };
+            }
+        }
+        let of_part = |part: &Part| part.component.registered().next().unwrap_or(ImageId(0));
+        let best_found = hypotheses.get(best);
+        let seen = best_found.map(|hypothesis| hypothesis.seen).unwrap_or_default();
+        let likeness = best_found.map(|hypothesis| hypothesis.likeness).unwrap_or_default();
+        report.merges.push(MergeRecord {
+            first_images: [of_part(self.kept), of_part(self.moved)],
+            images: [self.kept.size(), self.moved.size()],
+            verdict: verdicts.get(best).copied().unwrap_or(MergeVerdict::Unsupported),
+            candidates,
+            inliers: best_found.map_or(0, |hypothesis| hypothesis.support),
+            expected: seen.map(|seen| seen.expected),
+            matched: seen.map(|seen| seen.matched),
+            expected_cells: seen.map(|seen| seen.expected_cells),
+            matched_cells: seen.map(|seen| seen.matched_cells),
+            expected_matches: likeness.expected,
+            found_matches: likeness.matched,
+        });
+        let mut mapper = joined?;
+        report.registrations.append(&mut mapper.records);
+        Some(mapper.into_part())
+    }
+
+    /// Up to as many similarities as poses of one image, best first: each is sought among what the ones before leave.
+    fn hypotheses(&self, crossings: &[Crossing]) -> Vec<Hypothesis> {
+        let ransac = RansacParams { min_inliers: self.params.min_confirmed_inliers, ..self.params.ransac() };
+        let bound = self.params.max_error_sigma;
+        let mut rest = crossings.to_vec();
+        let mut found = Vec::new();
+        for round in 0..self.params.max_pose_hypotheses as u64 {
+            let seed = self.seed.wrapping_add(round);
+            let verified = rest.iter().filter(|crossing| crossing.verified);
+            let mut candidates = Sights::collect(&self.sides, verified).estimate(&ransac, seed);
+            if rest.iter().any(|crossing| !crossing.verified) {
+                candidates.extend(Sights::collect(&self.sides, rest.iter()).estimate(&ransac, seed));
+            }
+            let score = |candidate: &Similarity| self.sides.score(&rest, candidate, bound);
+            let best = candidates
+                .into_iter()
+                .map(|candidate| self.refined(&rest, candidate))
+                .map(|candidate| (score(&candidate), candidate))
+                .reduce(|best, next| if next.0 < best.0 { next } else { best });
+            let Some((_, mut kept_from_moved)) = best else { break };
+            let mut agreeing = self.sides.agreeing(&rest, &kept_from_moved, bound);
+            let seen = self.seen(&kept_from_moved, &agreeing);
+            if distinct(&agreeing) >= MIN_SEED {
+                for max_angle_rad in GUIDED_BANDS_RAD {
+                    let guide = GuidedParams { max_angle_rad, ..GuidedParams::default() };
+                    let mut all = self.sides.guided(&kept_from_moved, &guide);
+                    all.extend_from_slice(&rest);
+                    let all = once(all);
+                    kept_from_moved = self.refined(&all, kept_from_moved);
+                    agreeing = self.sides.agreeing(&all, &kept_from_moved, bound);
+                }
+            }
+            let gone: BTreeSet<_> = agreeing.iter().map(|crossing| (crossing.kept, crossing.moved)).collect();
+            rest.retain(|crossing| !gone.contains(&(crossing.kept, crossing.moved)));
+            let support = distinct(&agreeing);
+            let likeness = self.likeness(&kept_from_moved, &agreeing);
+            found.push(Hypothesis { kept_from_moved, agreeing, support, seen, likeness });
+        }
+        found
+    }
+
+    /// A similarity fitted to what agrees with it, if that makes more agree.
+    fn refined(&self, crossings: &[Crossing], initial: Similarity) -> Similarity {
+        let bound = self.params.max_error_sigma;
+        let mut best = (self.sides.score(crossings, &initial, bound), initial);
+        for widening in [6.0, 3.0, 1.0, 1.0] {
+            let near = self.sides.agreeing(crossings, &best.1, widening * bound);
+            let sights = Sights::collect(&self.sides, near.iter());
+            let fitted = sights.refine(&best.1, self.params.loss_sigma);
+            let score = self.sides.score(crossings, &fitted, bound);
+            if score < best.0 {
+                best = (score, fitted);
+            }
+        }
+        best.1
+    }
+
+    /// What the images of either component see of the other's points, over all of them.
+    fn seen(&self, kept_from_moved: &Similarity, agreeing: &[Crossing]) -> [Visibility; 2] {
+        let moved_from_kept = kept_from_moved.inverse();
+        let sum =
+            |of: &Model<'_>, at: &Model<'_>, at_from_of: &Similarity, matched: &[(ImageId, u32, PointId)]| {
+                let images: Vec<ImageId> = of.registered().collect();
+                let seen: Vec<Visibility> = images
+                    .into_par_iter()
+                    .filter_map(|image| {
+                        let pose = at_from_of.transform_pose(&of.poses[image.index()]?.world_from_camera);
+                        let inliers: Vec<(u32, PointId)> = matched
+                            .iter()
+                            .filter(|(seen_in, ..)| *seen_in == image)
+                            .map(|&(_, feature, id)| (feature, id))
+                            .collect();
+                        Some(visibility(at, image, &pose, &inliers))
+                    })
+                    .collect();
+                seen.into_iter().sum()
+            };
+        let by_moved: Vec<_> =
+            agreeing.iter().filter_map(|c| Some((c.moved.image, c.moved.feature, c.kept_point?))).collect();
+        let by_kept: Vec<_> =
+            agreeing.iter().filter_map(|c| Some((c.kept.image, c.kept.feature, c.moved_point?))).collect();
+        let Sides { kept, moved } = self.sides;
+        [sum(moved, kept, kept_from_moved, &by_moved), sum(kept, moved, &moved_from_kept, &by_kept)]
+    }
+
+    fn likeness(&self, kept_from_moved: &Similarity, agreeing: &[Crossing]) -> Likeness {
+        let Sides { kept, moved } = self.sides;
+        let by_moved: Vec<_> = agreeing.iter().filter_map(|c| Some((c.moved.image, c.kept_point?))).collect();
+        let by_kept: Vec<_> = agreeing.iter().filter_map(|c| Some((c.kept.image, c.moved_point?))).collect();
+        likeness(moved, kept, kept_from_moved, &by_moved)
+            + likeness(kept, moved, &kept_from_moved.inverse(), &by_kept)
+    }
+
+    fn judge(&self, crossings: &[Crossing], hypothesis: &Hypothesis) -> MergeVerdict {
+        let params = self.params;
+        let Hypothesis { kept_from_moved, agreeing, support, seen, likeness } = hypothesis;
+        if *support < params.min_registration_inliers {
+            return MergeVerdict::Unsupported;
+        }
+        let sights = Sights::collect(&self.sides, agreeing.iter());
+        let sigma = sights.log_scale_sigma(kept_from_moved, params.loss_sigma);
+        if !(self.is_spread(agreeing) && sigma <= MAX_LOG_SCALE_SIGMA) {
+            return MergeVerdict::ScaleOpen;
+        }
+        let is_judged = |seen: &Visibility| seen.expected >= params.min_visible_points;
+        let is_recognized = if likeness.expected >= MIN_EXPECTED_MATCHES {
+            likeness.matched >= MIN_LIKENESS * likeness.expected
+        } else if seen.iter().any(is_judged) {
+            seen.iter().all(|seen| !is_judged(seen) || params.is_recognized(seen))
+        } else {
+            let verified = |of: &[Crossing]| of.iter().filter(|crossing| crossing.verified).count() as f64;
+            let confirmed = verified(agreeing) >= params.min_confirmed_share * verified(crossings);
+            confirmed && *support >= UNJUDGED_SUPPORT * params.min_registration_inliers
+        };
+        if !is_recognized {
+            return MergeVerdict::NotRecognized;
+        }
+        if self.pair_agreement(kept_from_moved) < params.min_pair_agreement {
+            return MergeVerdict::PairsDisagree;
+        }
+        if self.positions_disagree(kept_from_moved) {
+            return MergeVerdict::PositionsDisagree;
+        }
+        MergeVerdict::Joined
+    }
+
+    /// Whether the scale rests on more than one image: on two of either component, or on points that both have.
+    fn is_spread(&self, agreeing: &[Crossing]) -> bool {
+        let shared: Vec<Crossing> = agreeing
+            .iter()
+            .filter(|crossing| crossing.kept_point.is_some() && crossing.moved_point.is_some())
+            .copied()
+            .collect();
+        if distinct(&shared) >= self.params.min_registration_inliers {
+            return true;
+        }
+        let spread = |images: Vec<ImageId>| {
+            let mut counts = vec![0_usize; self.sides.kept.poses.len()];
+            for image in images {
+                counts[image.index()] += 1;
+            }
+            counts.iter().filter(|&&count| count >= IMAGE_MATCHES).count() >= 2
+        };
+        let of_moved = agreeing.iter().filter(|c| c.kept_point.is_some()).map(|c| c.moved.image);
+        let of_kept = agreeing.iter().filter(|c| c.moved_point.is_some()).map(|c| c.kept.image);
+        spread(of_moved.collect()) || spread(of_kept.collect())
+    }
+
+    /// Share of the verified matches between the components that belong to pairs whose rotation agrees.
+    fn pair_agreement(&self, kept_from_moved: &Similarity) -> f64 {
+        let Sides { kept, moved } = self.sides;
+        let (mut agreeing, mut all) = (0, 0);
+        for pair in kept.input.pairs {
+            let rotation = |image: ImageId| {
+                let of_kept = kept.poses[image.index()].map(|pose| pose.world_from_camera.rotation);
+                let of_moved = moved.poses[image.index()]
+                    .map(|pose| kept_from_moved.rotation * pose.world_from_camera.rotation);
+                of_kept.or(of_moved)
+            };
+            let crosses = kept.is_registered(pair.first) != kept.is_registered(pair.second);
+            let (Some(first), Some(second), true) = (rotation(pair.first), rotation(pair.second), crosses)
+            else {
+                continue;
+            };
+            all += pair.two_view.inliers.len();
+            let deviation = (second.inverse() * first).angle_to(&pair.two_view.second_from_first.rotation);
+            if deviation.to_degrees() <= self.params.max_pair_rotation_deg {
+                agreeing += pair.two_view.inliers.len();
+            }
+        }
+        if all == 0 { 1.0 } else { agreeing as f64 / all as f64 }
+    }
+
+    /// Whether most measured distances between the images of the two components are far from those of the model.
+    ///
+    /// Distances need no common frame; the median over all of them forgives some wrong positions. Where the measured
+    /// positions of the larger component lie within their own error, they say nothing.
+    fn positions_disagree(&self, kept_from_moved: &Similarity) -> bool {
+        let Sides { kept, moved } = self.sides;
+        let measured = |model: &Model<'_>, kept_from_model: &Similarity| -> Vec<_> {
+            let place = |image: ImageId| {
+                let center = kept_from_model.transform_point(model.poses[image.index()]?.center());
+                Some((center, model.input.images[image.index()].position_prior?))
+            };
+            model.registered().filter_map(place).collect()
+        };
+        let of_kept = measured(kept, &Similarity::identity());
+        let of_moved = measured(moved, kept_from_moved);
+        let mut metres: Vec<f64> = Vec::new();
+        for (at, a) in of_kept.iter().enumerate() {
+            for b in &of_kept[at + 1..] {
+                let distance = (a.1 - b.1).norm();
+                if distance > MAX_POSITION_ERROR_M {
+                    metres.push(distance / (a.0 - b.0).norm());
+                }
+            }
+        }
+        let Some(metres) = median(metres) else { return false };
+        let crossing = of_kept.iter().flat_map(|a| of_moved.iter().map(move |b| (a, b)));
+        let excess = crossing.map(|(a, b)| {
+            let distance = (a.1 - b.1).norm();
+            let error = (metres * (a.0 - b.0).norm() - distance).abs();
+            error - MAX_POSITION_ERROR_M - MAX_POSITION_ERROR_SHARE * distance
+        });
+        median(excess.collect()).is_some_and(|excess| excess > 0.0)
+    }
+
+    /// Whether two hypotheses put the moved component at different places.
+    fn differ(&self, a: &Hypothesis, b: &Hypothesis) -> bool {
+        let turn = a.kept_from_moved.rotation.angle_to(&b.kept_from_moved.rotation);
+        if turn.to_degrees() > self.params.max_pair_rotation_deg {
+            return true;
+        }
+        let moved = |crossing: &Crossing| {
+            let id = crossing.moved_point?;
+            let point = self.sides.moved.point(id)?.position;
+            let center = *self.sides.moved.poses[crossing.moved.image.index()]?.center();
+            let by = |similarity: &Similarity, x| similarity.transform_point(x);
+            let step = (by(&a.kept_from_moved, &center) - by(&b.kept_from_moved, &center)).norm();
+            Some(step / ((point - center).norm() * a.kept_from_moved.scale))
+        };
+        let steps = a.agreeing.iter().chain(&b.agreeing).filter_map(moved).collect();
+        median(steps).is_none_or(|step| step > SAME_PLACE)
+    }
+
+    /// The joined component, unless the adjustment of both together contradicts the similarity.
+    fn join(&self, hypothesis: &Hypothesis, taken: Vec<bool>) -> Option<Mapper<'a>> {
+        let input = self.sides.kept.input;
+        let components = [&self.kept.component, &self.moved.component];
+        let model = Model::of_components(input, components[0], components[1], &hypothesis.kept_from_moved);
+        let mut mapper = Mapper::over(self.params, model, taken, self.seed);
+        let anchors = self.kept.anchors.iter().zip(&self.moved.anchors);
+        mapper.anchors = anchors.map(|(of_kept, of_moved)| of_kept.or(*of_moved)).collect();
+        let limits = self.params.limits();
+        for _ in 0..2 {
+            for crossing in &hypothesis.agreeing {
+                connect(&mut mapper.model, limits, crossing.kept, crossing.moved);
+            }
+            complete_and_merge(&mut mapper.model, &mapper.graph, limits);
+            mapper.refine(2, 20);
+        }
+        if !self.holds(&mapper) {
+            return None;
+        }
+        mapper.grow();
+        mapper.finish();
+        let stays = |image: ImageId| mapper.model.is_registered(image);
+        let all_stay = components.iter().all(|component| component.registered().all(stays));
+        all_stay.then_some(mapper)
+    }
+
+    /// Whether the adjusted whole keeps what either component knew and what holds them together.
+    fn holds(&self, mapper: &Mapper<'_>) -> bool {
+        let model = &mapper.model;
+        let sides = [self.sides.kept, self.sides.moved];
+        let keeps = |side: &Model<'_>| {
+            let count =
+                |of: &Model<'_>| side.registered().map(|image| of.observed_points(image)).sum::<usize>();
+            count(model) as f64 >= MIN_KEPT_OBSERVATIONS * count(side) as f64
+        };
+        let ties = model
+            .live_points()
+            .filter(|(_, point)| {
+                sides.iter().all(|side| point.track.iter().any(|seen| side.is_registered(seen.image)))
+            })
+            .count();
+        let all: Vec<ImageId> = model.registered().collect();
+        let recognizes = |of: &Model<'_>, at: &Model<'_>| {
+            let seen: Visibility = of
+                .registered()
+                .filter_map(|image| {
+                    let pose = model.poses[image.index()]?.world_from_camera;
+                    let mut others = model.registered_neighbours(image);
+                    others.retain(|&other| at.is_registered(other));
+                    Some(visibility_beside(model, image, &pose, &model.observations_of(image), &others))
+                })
+                .sum();
+            seen.expected < self.params.min_visible_points || self.params.is_recognized(&seen)
+        };
+        sides.into_iter().all(keeps)
+            && ties >= self.params.min_registration_inliers
+            && mapper.first_misplaced(&all).is_none()
+            && recognizes(self.sides.moved, self.sides.kept)
+            && recognizes(self.sides.kept, self.sides.moved)
+    }
+}
+
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.retain(|value| value.is_finite());
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}
