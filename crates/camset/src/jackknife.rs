@@ -60,7 +60,7 @@ fn without_groups(params: &BundleParams, problem: &BundleProblem) -> Vec<BundleP
         bundle::solve(params, &mut part);
         part
     };
-    (0..GROUPS).into_par_iter().map(without).collect()
+    (0..GROUPS).into_par_iter().with_max_len(1).map(without).collect()
 }
 
 /// The problem adjusted from where it is and from where its parts are; the one of least cost, of equals the first.
@@ -69,6 +69,7 @@ fn best_of(params: &BundleParams, problem: &BundleProblem, parts: &[BundleProble
         .chain(parts)
         .collect::<Vec<_>>()
         .into_par_iter()
+        .with_max_len(1)
         .map(|start| {
             let mut whole = BundleProblem { observations: problem.observations.clone(), ..start.clone() };
             let report = bundle::solve(params, &mut whole);

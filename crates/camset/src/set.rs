@@ -41,6 +41,7 @@ pub fn locate_set(
 ) -> SetLocalization {
     let evidence: Vec<PhotoEvidence> = photos
         .par_iter()
+        .with_max_len(1)
         .enumerate()
         .map(|(number, photo)| {
             let nearest = scene.index.nearest_points(&photo.features.descriptors);

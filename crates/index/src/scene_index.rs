@@ -13,6 +13,9 @@ use crate::{Backend, IndexParams, NearestPoints};
 /// Queries that share one pass over the rows.
 const TILE_QUERIES: usize = 64;
 
+/// Queries of the recall's measurement that are worth handing to another thread.
+const QUERIES_PER_TASK: usize = 8;
+
 /// One observation of a scene point.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Row {
@@ -129,11 +132,15 @@ impl SceneIndex {
         let amount = params.recall_queries.clamp(1, self.rows.len());
         let queries: Vec<u32> =
             index::sample(&mut rng, self.rows.len(), amount).iter().map(|row| row as u32).collect();
-        let truth: Vec<NearestPoints> =
-            queries.par_iter().map(|&row| self.nearest_among(row, 0..self.rows.len() as u32)).collect();
+        let truth: Vec<NearestPoints> = queries
+            .par_iter()
+            .with_max_len(QUERIES_PER_TASK)
+            .map(|&row| self.nearest_among(row, 0..self.rows.len() as u32))
+            .collect();
         loop {
             let found: Vec<NearestPoints> = queries
                 .par_iter()
+                .with_max_len(QUERIES_PER_TASK)
                 .map(|&row| match &self.search {
                     Search::Exact => self.nearest_among(row, 0..self.rows.len() as u32),
                     Search::Inverted(lists) => {
@@ -268,6 +275,7 @@ impl SceneIndex {
     pub fn nearest_points(&self, queries: &[u8]) -> Vec<NearestPoints> {
         queries
             .par_chunks(TILE_QUERIES * DESCRIPTOR_LEN)
+            .with_max_len(1)
             .flat_map_iter(|tile| self.nearest_of_tile(tile))
             .collect()
     }

@@ -58,16 +58,17 @@ impl Artifact for ImageFeatures {
         if count.checked_mul(setloc_features::DESCRIPTOR_LEN) != Some(descriptors.len()) {
             return Err(wrong());
         }
-        let keypoint = |block: &[u8]| {
-            let value = |i: usize| f32::from_bits(number(&block[4 * i..4 * i + 4]) as u32);
-            Keypoint { x: value(0), y: value(1), size: value(2), orientation: value(3), noise_px: value(4) }
+        let keypoint = |block: &[u8; 20]| {
+            let [x, y, size, orientation, noise_px] =
+                [0, 4, 8, 12, 16].map(|at| f32::from_le_bytes(std::array::from_fn(|i| block[at + i])));
+            Keypoint { x, y, size, orientation, noise_px }
         };
         Ok(Self {
             width,
             height,
             light,
             simulated,
-            keypoints: keypoints.chunks_exact(20).map(keypoint).collect(),
+            keypoints: keypoints.as_chunks().0.iter().map(keypoint).collect(),
             descriptors: descriptors.to_vec(),
             colors: colors.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect(),
         })

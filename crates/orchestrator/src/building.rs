@@ -76,7 +76,7 @@ pub fn build_scene(
             return Ok(BuildOutcome::Unchanged(run.clone(), skipped));
         }
         let load_features = || {
-            let made = folder.images.par_iter().zip(&jobs.features);
+            let made = folder.images.par_iter().with_max_len(1).zip(&jobs.features);
             let made = made.filter(|(_, job)| executor.output(**job).is_some());
             made.map(|(image, job)| Ok((image.name.clone(), executor.load::<ImageFeatures>(*job)?))).collect()
         };

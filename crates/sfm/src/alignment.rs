@@ -183,7 +183,9 @@ fn in_each<T: Send, E: Send>(
     load: &(impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync),
     work: impl Fn(ImageId, &ImagePyramid) -> T + Sync,
 ) -> Result<Vec<T>, E> {
-    let found: Vec<Result<T, E>> = images.par_iter().map(|&image| Ok(work(image, &*load(image)?))).collect();
+    // Without a bound, rayon would leave the last images to one thread.
+    let images = images.par_iter().with_max_len(1);
+    let found: Vec<Result<T, E>> = images.map(|&image| Ok(work(image, &*load(image)?))).collect();
     found.into_iter().collect()
 }
 
@@ -642,7 +644,7 @@ fn store(component: &mut Reconstruction, features: &[&ImageFeatures], problem: &
     for (point, adjusted) in component.points.iter_mut().zip(&problem.points) {
         point.position = adjusted.position;
     }
-    let rays: Vec<Rays> = (component.images.par_iter().zip(features))
+    let rays: Vec<Rays> = (component.images.par_iter().with_max_len(1).zip(features))
         .map(|(image, features)| features.rays(&component.cameras[image.camera.index()]))
         .collect();
     let camera_from_world: Vec<Option<Rigid>> =

@@ -496,6 +496,7 @@ impl<'a> Mapper<'a> {
             .collect();
         let mut waiting: Vec<(usize, ImageId)> = open
             .into_par_iter()
+            .with_max_len(1)
             .map(|image| (count_scene_matches(&self.model, &self.graph, image), image))
             .filter(|&(count, image)| {
                 count >= self.params.min_confirmed_inliers.min(self.params.min_registration_inliers)
@@ -507,7 +508,8 @@ impl<'a> Mapper<'a> {
         // The first few in any case, the others until one is acceptable.
         let (few, others) = waiting.split_at(waiting.len().min(3));
         for tried in std::iter::once(few).chain(others.chunks(2)) {
-            let poses: Vec<_> = tried.par_iter().map(|&(_, image)| self.acceptable_pose(image)).collect();
+            let poses: Vec<_> =
+                tried.par_iter().with_max_len(1).map(|&(_, image)| self.acceptable_pose(image)).collect();
             for (&(count, image), (pose, mut records)) in tried.iter().zip(poses) {
                 self.records.append(&mut records);
                 match pose {
@@ -621,7 +623,7 @@ impl<'a> Mapper<'a> {
             let judged = seen.expected >= self.params.min_visible_points;
             (judged && !self.params.is_recognized(&seen)).then_some((at, seen))
         };
-        images.par_iter().enumerate().find_map_first(misplaced)
+        images.par_iter().with_max_len(1).enumerate().find_map_first(misplaced)
     }
 
     fn adjust_all(&mut self, max_iterations: u32) {

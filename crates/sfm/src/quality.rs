@@ -136,7 +136,7 @@ pub fn assess(
         counts
     };
     let share = reconstruction.points.len().div_ceil(TASKS).max(1);
-    let parts: Vec<Counts> = reconstruction.points.par_chunks(share).map(count).collect();
+    let parts: Vec<Counts> = reconstruction.points.par_chunks(share).with_max_len(1).map(count).collect();
     let sum = |of: fn(&Counts) -> &[u32], len: usize| {
         let mut sums = vec![0_usize; len];
         for part in &parts {

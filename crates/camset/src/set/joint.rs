@@ -185,6 +185,7 @@ impl Component<'_> {
     fn rays<'c>(&'c self, cameras: &'c [Camera]) -> Vec<PhotoRays<'c>> {
         (0..self.members.len())
             .into_par_iter()
+            .with_max_len(1)
             .map(|slot| {
                 PhotoRays::new(self.photos[self.members[slot]].features, &cameras[self.camera_of(slot)])
             })
@@ -347,6 +348,7 @@ impl Component<'_> {
             GuidedParams { radius_px: self.params.guided.radius_px * widening, ..self.params.guided.clone() };
         let guided: Vec<Vec<SceneMatch>> = (0..self.members.len())
             .into_par_iter()
+            .with_max_len(1)
             .map(|slot| {
                 let pose = &model.photos[slot].world_from_camera;
                 let nearest = &self.evidence[self.members[slot]].nearest;

@@ -89,6 +89,7 @@ fn nearest_lists(descriptors: &[u8], centroids: &[u8]) -> Vec<usize> {
     let centroids = DescriptorBlock::new(centroids);
     descriptors
         .par_chunks(ASSIGNED_AT_ONCE * DESCRIPTOR_LEN)
+        .with_max_len(1)
         .flat_map_iter(|part| centroids.two_nearest(part))
         .map(|nearest| nearest.index as usize)
         .collect()

@@ -146,7 +146,7 @@ fn write_models(folder: &Path, built: &Built) -> Result<()> {
         &|| write_json(&folder.join("poses.json"), &scene_json(&built.scene)),
         &|| write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?),
     ];
-    writers.into_par_iter().try_for_each(|write| write())
+    writers.into_par_iter().with_max_len(1).try_for_each(|write| write())
 }
 
 /// What the build cost and what is wrong with the scene; written last.

@@ -114,6 +114,7 @@ impl ImageFolder {
         };
         let read: Vec<Result<SourceImage, SkippedImage>> = files
             .par_iter()
+            .with_max_len(1)
             .map(|(name, path)| {
                 let skip =
                     |error: anyhow::Error| SkippedImage { name: name.clone(), reason: format!("{error:#}") };

@@ -76,7 +76,7 @@ pub fn write_colmap(
     };
     let (points, images) = rayon::join(
         || model.points.par_iter().enumerate().map(point).collect::<Result<String, _>>(),
-        || model.images.par_iter().enumerate().map(image).collect::<Result<String, _>>(),
+        || model.images.par_iter().with_max_len(1).enumerate().map(image).collect::<Result<String, _>>(),
     );
     let points =
         format!("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n{}", points?);

@@ -206,7 +206,7 @@ pub(super) fn for_each_chunk(chunks: &mut [Chunk], work: impl Fn(&mut Chunk) + S
     if let [chunk] = chunks {
         work(chunk);
     } else {
-        chunks.par_iter_mut().for_each(work);
+        chunks.par_iter_mut().with_max_len(1).for_each(work);
     }
 }
 

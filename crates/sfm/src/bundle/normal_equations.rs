@@ -230,7 +230,7 @@ impl<const D: usize> NormalEquations<D> {
                 ..Chunk::default()
             }
         };
-        let chunks = ranges.into_par_iter().map(chunk).collect();
+        let chunks = ranges.into_par_iter().with_max_len(1).map(chunk).collect();
 
         let targets = links
             .par_iter()

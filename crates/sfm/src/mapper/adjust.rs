@@ -1,6 +1,9 @@
-use super::model::Model;
+use rayon::prelude::*;
+
+use super::model::{Model, ModelPoint};
+use super::structure::POINTS_PER_TASK;
 use crate::{
-    ImageId, PointId,
+    ImageId, Observation, PointId,
     bundle::{
         self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, BundleReport,
         IntrinsicsFreedom,
@@ -60,7 +63,6 @@ pub(super) fn is_adjustable(model: &Model<'_>, image: ImageId) -> bool {
 /// When every registered image is free the first one is held, which fixes six of the seven gauge freedoms; scale is
 /// left to the damping.
 pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope) -> BundleReport {
-    let mut pose_of_image: Vec<Option<u32>> = vec![None; model.poses.len()];
     let mut problem = BundleProblem {
         cameras: model.cameras.clone(),
         camera_freedom: vec![IntrinsicsFreedom::FIXED; model.cameras.len()],
@@ -87,32 +89,33 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
         }
     }
 
-    let mut kept = Vec::with_capacity(scope.points.len());
-    for &id in &scope.points {
-        let Some(point) = model.point(id) else { continue };
-        let index = problem.points.len() as u32;
-        problem.points.push(BundlePoint { position: point.position, fixed: false });
-        kept.push(id);
-        for &seen in &point.track {
-            let Some(pose) = &model.poses[seen.image.index()] else { continue };
-            let next = problem.poses.len() as u32;
-            let pose_index = *pose_of_image[seen.image.index()].get_or_insert_with(|| {
-                problem.poses.push(BundlePose {
-                    camera: model.input.images[seen.image.index()].camera.0,
-                    world_from_camera: pose.world_from_camera,
-                    fixed: !free[seen.image.index()],
-                });
-                next
-            });
-            let keypoint = &model.input.images[seen.image.index()].features.keypoints[seen.feature as usize];
-            problem.observations.push(BundleObservation {
-                pose: pose_index,
-                point: index,
-                pixel: keypoint.pixel(),
-                noise_px: f64::from(keypoint.noise_px),
-            });
-        }
+    let mut pose_of_image: Vec<Option<u32>> = vec![None; model.poses.len()];
+    for (index, pose) in model.poses.iter().enumerate() {
+        let Some(pose) = pose else { continue };
+        pose_of_image[index] = Some(problem.poses.len() as u32);
+        problem.poses.push(BundlePose {
+            camera: model.input.images[index].camera.0,
+            world_from_camera: pose.world_from_camera,
+            fixed: !free[index],
+        });
     }
+    let kept: Vec<(PointId, &ModelPoint)> =
+        scope.points.iter().filter_map(|&id| Some((id, model.point(id)?))).collect();
+    problem.points =
+        kept.iter().map(|(_, point)| BundlePoint { position: point.position, fixed: false }).collect();
+    let sighting = |index: usize, seen: &Observation| {
+        let keypoint = &model.input.images[seen.image.index()].features.keypoints[seen.feature as usize];
+        Some(BundleObservation {
+            pose: pose_of_image[seen.image.index()]?,
+            point: index as u32,
+            pixel: keypoint.pixel(),
+            noise_px: f64::from(keypoint.noise_px),
+        })
+    };
+    problem.observations = (kept.par_iter().with_min_len(POINTS_PER_TASK).enumerate())
+        .flat_map_iter(|(index, (_, point))| point.track.iter().filter_map(move |seen| sighting(index, seen)))
+        .collect();
+    let kept: Vec<PointId> = kept.into_iter().map(|(id, _)| id).collect();
     let report = bundle::solve(params, &mut problem);
 
     for (camera, freedom) in problem.camera_freedom.iter().enumerate() {

@@ -311,6 +311,7 @@ impl<'a> Attempt<'_, '_, 'a> {
                 let images: Vec<ImageId> = of.registered().collect();
                 let seen: Vec<Visibility> = images
                     .into_par_iter()
+                    .with_max_len(1)
                     .filter_map(|image| {
                         let pose = at_from_of.transform_pose(&of.poses[image.index()]?.world_from_camera);
                         let inliers: Vec<(u32, PointId)> = matched

@@ -104,7 +104,7 @@ impl<'a> Model<'a> {
             let camera = &cameras[image.camera.index()];
             if has_rays(index) { image.features.rays(camera) } else { Rays::default() }
         };
-        let rays = input.images.par_iter().enumerate().map(rays_of).collect();
+        let rays = input.images.par_iter().with_max_len(1).enumerate().map(rays_of).collect();
         Self {
             input,
             cameras,
@@ -320,7 +320,7 @@ impl<'a> Model<'a> {
     /// Recomputes the rays of every image that uses `camera` after its intrinsics have changed.
     pub fn refresh_rays(&mut self, camera: usize) {
         let camera_now = &self.cameras[camera];
-        self.rays.par_iter_mut().zip(&self.input.images).for_each(|(rays, image)| {
+        self.rays.par_iter_mut().with_max_len(1).zip(&self.input.images).for_each(|(rays, image)| {
             if image.camera.index() == camera {
                 *rays = image.features.rays(camera_now);
             }

@@ -12,7 +12,7 @@ pub(super) struct PointLimits {
 }
 
 /// Points that are worth handing to another thread.
-const POINTS_PER_TASK: usize = 256;
+pub(super) const POINTS_PER_TASK: usize = 256;
 
 /// What becomes of a free keypoint.
 enum Step {
@@ -150,7 +150,15 @@ pub(super) fn complete_and_merge(
     limits: PointLimits,
 ) -> usize {
     let mut changes = 0;
-    for id in model.live_ids() {
+    // Whose partners are all its own has nothing to take in, and nobody takes it in.
+    let is_open = |seen: &Observation, id: PointId| {
+        let mut partners = graph.partners(seen.image, seen.feature).iter();
+        partners.any(|partner| model.is_registered(partner.image) && model.point_of(*partner) != Some(id))
+    };
+    let open: Vec<PointId> = (model.live_ids().into_par_iter().with_min_len(POINTS_PER_TASK))
+        .filter(|&id| model.point(id).is_some_and(|point| point.track.iter().any(|seen| is_open(seen, id))))
+        .collect();
+    for id in open {
         let mut next = 0;
         // The track grows while it is walked, so what was just added is followed too.
         while let Some(point) = model.point(id) {

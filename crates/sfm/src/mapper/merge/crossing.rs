@@ -82,6 +82,7 @@ impl<'a> Sides<'_, 'a> {
         let found: Vec<Vec<Crossing>> = self
             .like_views(kept_from_moved)
             .into_par_iter()
+            .with_max_len(1)
             .map(|(kept, moved)| {
                 let mut found = Vec::new();
                 let (Some(of_kept), Some(of_moved)) =
@@ -120,6 +121,7 @@ impl<'a> Sides<'_, 'a> {
                 let mut ranked: Vec<(usize, ImageId)> = others
                     .registered_neighbours(image)
                     .into_par_iter()
+                    .with_max_len(1)
                     .map(|other| (others.points_seen_alike(other, &center), other))
                     .filter(|(count, _)| *count >= MIN_ALIKE)
                     .collect();

@@ -78,6 +78,7 @@ fn own_rates(model: &Model<'_>) -> [f64; BINS] {
     let images: Vec<ImageId> = model.registered().collect();
     let counts: Vec<([usize; BINS], [usize; BINS])> = images
         .into_par_iter()
+        .with_max_len(1)
         .map(|image| {
             let (mut expected, mut seen) = ([0; BINS], [0; BINS]);
             let Some(pose) = &model.poses[image.index()] else { return (expected, seen) };
@@ -111,6 +112,7 @@ pub(super) fn likeness(
     let images: Vec<ImageId> = of.registered().collect();
     let counts: Vec<Likeness> = images
         .into_par_iter()
+        .with_max_len(1)
         .map(|image| {
             let Some(pose) = &of.poses[image.index()] else { return Likeness::default() };
             let mut is_matched = vec![false; at.points.len()];
