@@ -54,6 +54,8 @@ pub fn build_scene(
 ) -> Result<BuildOutcome> {
     let mut graph = JobGraph::default();
     let jobs = add_scene(&mut graph, &folder.images, config, seed)?;
+    graph.want(jobs.scene);
+    jobs.features.iter().for_each(|features| graph.want(*features));
     session.run(name, &graph, |executor, run| {
         session.remember(name, run)?;
         let mut skipped = folder.skipped.clone();

@@ -26,7 +26,7 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 ///
 /// 2: holds the hash of what localization depends on, and only the configuration that the scene depends on.
 /// 4: notes.
-pub const SCENE_VERSION: u32 = 4;
+pub const SCENE_VERSION: u32 = 5;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
 /// Version of set localization.

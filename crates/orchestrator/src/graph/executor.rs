@@ -157,7 +157,7 @@ impl<'a> Executor<'a> {
                 key: None,
                 output: None,
                 value: None,
-                users_left: graph.users(id).count(),
+                users_left: graph.user_count(id),
                 dependencies_left: graph.uses(id).count(),
             })
             .collect();
@@ -382,8 +382,7 @@ impl<'a> Executor<'a> {
         let Product { value, file } = product?;
         let output = ContentHash::of(&file);
         let slot = &mut self.lock().slots[id.index()];
-        // What no job uses is what the graph was run for.
-        if slot.users_left > 0 || self.graph.users(id).next().is_none() {
+        if slot.users_left > 0 {
             slot.value = Some(value);
         }
         Ok(Unkept { id, fingerprint, output, file, started_secs, wall_secs, cpu_secs })

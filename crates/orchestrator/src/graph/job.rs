@@ -1,7 +1,7 @@
 //! Jobs and the graph they form.
 
 use std::any::Any;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::sync::Arc;
 
@@ -74,12 +74,18 @@ pub(super) struct Use {
 #[derive(Default)]
 pub struct JobGraph<'a> {
     pub(super) graph: DiGraph<Job<'a>, Use>,
+    wanted: BTreeSet<JobId>,
 }
 
 impl<'a> JobGraph<'a> {
     /// Adds a job; it must be added after the jobs that it uses.
     pub fn add(&mut self, job: Job<'a>) -> JobId {
         self.graph.add_node(job)
+    }
+
+    /// Says that the caller will load the result of a job: it stays in memory once it is there.
+    pub fn want(&mut self, job: JobId) {
+        self.wanted.insert(job);
     }
 
     /// Lets `user` use the result of `used`; without it, `user` is left out.
@@ -123,6 +129,11 @@ impl<'a> JobGraph<'a> {
 
     pub(super) fn uses(&self, id: JobId) -> impl Iterator<Item = (JobId, &Use)> {
         self.graph.edges_directed(id, Direction::Incoming).map(|edge| (edge.source(), edge.weight()))
+    }
+
+    /// How many will load a job's result.
+    pub(super) fn user_count(&self, id: JobId) -> usize {
+        self.users(id).count() + usize::from(self.wanted.contains(&id))
     }
 
     pub(super) fn users(&self, id: JobId) -> impl Iterator<Item = JobId> {

@@ -80,8 +80,12 @@ pub fn add_scene(
             components: output.components.iter().map(|model| named(model, &names)).collect(),
             index: (*index).clone(),
             origin: output.report.georegistration.as_ref().and(origin),
-            warnings: output.report.warnings.iter().map(|text| with_names(text, &names)).collect(),
-            notes: output.report.merges.iter().filter_map(MergeRecord::sentence).collect(),
+            warnings: (output.report.warnings.iter().map(|text| with_names(text, &names)))
+                .chain(index.recall().filter(|recall| *recall < MIN_RECALL).map(poor_recall))
+                .collect(),
+            notes: (output.report.merges.iter().filter_map(MergeRecord::sentence))
+                .chain(index.recall().map(measured_recall))
+                .collect(),
             config: config.clone(),
             content: ContentHash::of_all(&[inputs.hash("model")?, inputs.hash("index")?]),
         })
@@ -102,6 +106,24 @@ pub fn add_scene(
         features[at] = job;
     }
     Ok(SceneJobs { features, model: jobs.model, scene })
+}
+
+/// Share of the nearest scene points below which an index is said to miss too many.
+const MIN_RECALL: f64 = 0.95;
+
+fn measured_recall(recall: f64) -> String {
+    format!(
+        "the index finds {:.1} % of the nearest scene points (asked for the scene's own descriptors)",
+        100.0 * recall
+    )
+}
+
+fn poor_recall(recall: f64) -> String {
+    format!(
+        "the index misses {:.1} % of the nearest scene points: raise `index.max_candidates` or choose another \
+         `index.backend`",
+        100.0 * (1.0 - recall)
+    )
 }
 
 /// The images in the order of their content (their numbers in it), and the pairs as places in that order.
