@@ -1,4 +1,5 @@
-//! Features and matches of consecutive images of a data set, judged by its exact poses where it has them.
+//! Features and matches of consecutive images of a data set, judged by its exact poses where it has them: by size, and
+//! for panoramas by latitude and at the seam.
 //!
 //! Reads `cameras.json` beside `truth.json`; without truth, cameras are guessed.
 //!
@@ -19,6 +20,10 @@ use setloc_features::{
 
 /// A match further than this from its epipolar plane is wrong.
 const MAX_ANGLE_DEG: f64 = 0.25;
+/// Where bands of latitude of panoramas end.
+const LATITUDES_DEG: [f64; 5] = [15.0, 30.0, 45.0, 60.0, 90.0];
+/// A match with an end nearer to the seam than this is across it, or nearly so.
+const SEAM_DEG: f64 = 5.0;
 
 struct Image {
     name: String,
@@ -73,6 +78,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         images.push(Image { name, features, rays });
     }
     let mut angles_by_size: Vec<(f32, f64, f64)> = Vec::new();
+    let mut by_place = ByPlace::default();
     for pair in images.windows(2) {
         let begin = Instant::now();
         let matches = match_features(&MatchParams::default(), &pair[0].features, &pair[1].features);
@@ -80,7 +86,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         if let Some(essential) =
             truth.as_ref().and_then(|truth| essential(truth, &pair[0].name, &pair[1].name))
         {
-            report(&matches, pair, &essential, Some(&mut angles_by_size));
+            report(&matches, pair, &essential, &mut angles_by_size, &mut by_place);
             let begin = Instant::now();
             let params = GuidedParams::default();
             let guided = match_guided(
@@ -92,6 +98,9 @@ fn main() -> Result<(), Box<dyn Error>> {
             print!("; guided {} in {:.1?}", guided.len(), begin.elapsed());
         }
         println!();
+    }
+    if truth.is_some() {
+        by_place.print(&images);
     }
     angles_by_size.sort_by(|a, b| a.0.total_cmp(&b.0));
     for group in angles_by_size.chunks((angles_by_size.len() / 10).max(1)) {
@@ -115,7 +124,8 @@ fn report(
     matches: &[Match],
     pair: &[Image],
     essential: &Matrix3<f64>,
-    sizes: Option<&mut Vec<(f32, f64, f64)>>,
+    sizes: &mut Vec<(f32, f64, f64)>,
+    by_place: &mut ByPlace,
 ) {
     let deviation = |found: &Match| {
         let (a, b) =
@@ -124,17 +134,60 @@ fn report(
         let (plane_b, plane_a) = (essential * a, essential.transpose() * b);
         b.dot(&plane_b).abs() / (plane_b.norm_squared() + plane_a.norm_squared()).sqrt()
     };
-    let right: Vec<&Match> =
-        matches.iter().filter(|found| deviation(found) < MAX_ANGLE_DEG.to_radians()).collect();
+    let is_right = |found: &Match| deviation(found) < MAX_ANGLE_DEG.to_radians();
+    let right: Vec<&Match> = matches.iter().filter(|found| is_right(found)).collect();
     print!(", {} right", right.len());
-    if let Some(sizes) = sizes {
-        sizes.extend(right.iter().map(|found| {
-            let (first, second) = (found.first as usize, found.second as usize);
-            let variance = pair[0].rays.sigmas[first].powi(2) + pair[1].rays.sigmas[second].powi(2);
-            // Sampson's error of two equal σ has the deviation σ, of σ₁ and σ₂ about their root mean square.
-            (pair[0].features.keypoints[first].size, deviation(found), (variance / 2.0).sqrt())
-        }));
+    sizes.extend(right.iter().map(|found| {
+        let (first, second) = (found.first as usize, found.second as usize);
+        let variance = pair[0].rays.sigmas[first].powi(2) + pair[1].rays.sigmas[second].powi(2);
+        // Sampson's error of two equal σ has the deviation σ, of σ₁ and σ₂ about their root mean square.
+        (pair[0].features.keypoints[first].size, deviation(found), (variance / 2.0).sqrt())
+    }));
+    for found in matches {
+        let ends =
+            [&pair[0].rays.bearings[found.first as usize], &pair[1].rays.bearings[found.second as usize]];
+        by_place.count(ends, is_right(found));
     }
+}
+
+/// Matches by the latitude of their first end, and those at the seam.
+#[derive(Default)]
+struct ByPlace {
+    matches: [usize; LATITUDES_DEG.len()],
+    right: [usize; LATITUDES_DEG.len()],
+    right_at_seam: usize,
+}
+
+impl ByPlace {
+    fn count(&mut self, ends: [&Vector3<f64>; 2], is_right: bool) {
+        let band = band(ends[0]);
+        self.matches[band] += 1;
+        if is_right {
+            self.right[band] += 1;
+            let at_seam = |ray: &&Vector3<f64>| ray.x.atan2(-ray.z).abs() < SEAM_DEG.to_radians();
+            self.right_at_seam += usize::from(ends.iter().any(at_seam));
+        }
+    }
+
+    fn print(&self, images: &[Image]) {
+        let mut keypoints = [0; LATITUDES_DEG.len()];
+        for ray in images.iter().flat_map(|image| &image.rays.bearings) {
+            keypoints[band(ray)] += 1;
+        }
+        for (band, limit) in LATITUDES_DEG.iter().enumerate() {
+            println!(
+                "latitudes up to {limit}°: {} keypoints, {} matches, {} right",
+                keypoints[band], self.matches[band], self.right[band]
+            );
+        }
+        println!("within {SEAM_DEG}° of the seam: {} right", self.right_at_seam);
+    }
+}
+
+/// The band of latitudes that a ray lies in.
+fn band(ray: &Vector3<f64>) -> usize {
+    let latitude = ray.y.abs().clamp(0.0, 1.0).asin().to_degrees();
+    LATITUDES_DEG.iter().position(|&limit| latitude < limit).unwrap_or(LATITUDES_DEG.len() - 1)
 }
 
 fn essential(truth: &Value, first: &str, second: &str) -> Option<Matrix3<f64>> {
