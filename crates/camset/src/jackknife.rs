@@ -168,6 +168,7 @@ mod tests {
         }
         assert!(widened > 0);
     }
+
     #[test]
     fn a_pose_without_covariance_does_not_hide_the_next() {
         let mut alone = photo(3.0, 1, 0);

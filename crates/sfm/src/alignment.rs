@@ -127,6 +127,7 @@ pub fn align_tracks<E: Send>(
     let mut tracks = Tracks::new(params, component, features);
     // The first alignment tells the slant of the surfaces, the second goes by it.
     let (templates, facing) = tracks.align_all(&registered, &load)?;
+    // Tens of thousands of blocks: freeing them one after another is felt.
     templates.into_par_iter().for_each(drop);
     tracks.planes = tracks.tilted_planes(&facing);
     let (templates, aligned) = tracks.align_all(&registered, &load)?;
@@ -172,7 +173,6 @@ pub fn align_tracks<E: Send>(
     for (point, placed) in component.points.iter_mut().zip(placed) {
         (point.aligned, point.covariance) = placed.unzip();
     }
-    // Tens of thousands of blocks: freeing them one after another is felt.
     templates.into_par_iter().for_each(drop);
     Ok(report)
 }

@@ -180,12 +180,12 @@ impl Records {
     /// # Errors
     /// When the folder cannot be listed.
     pub fn all(&self) -> Result<Vec<(PathBuf, Vec<KeyRecord>)>> {
-        let whole = |text: Vec<u8>| lines(&text).filter_map(Result::ok).collect();
-        let files = self.files()?.into_iter();
-        Ok(files
-            .filter_map(|file| Some((fs::read(&file).map(whole).ok()?, file)))
-            .map(|(r, f)| (f, r))
-            .collect())
+        let read = |file: PathBuf| {
+            let text = fs::read(&file).ok()?;
+            let records = lines(&text).filter_map(Result::ok).collect();
+            Some((file, records))
+        };
+        Ok(self.files()?.into_iter().filter_map(read).collect())
     }
 
     /// Removes damaged records; returns the keys they seem to have, or the file and line where nothing is legible.
