@@ -3,16 +3,10 @@
 use nalgebra::{Matrix2, Matrix2x3, Unit, Vector2, Vector3};
 use setloc_features::{Camera, ImageFeatures, Rays};
 use setloc_index::SceneIndex;
-use setloc_sfm::{Place, PointId, Rigid};
+use setloc_sfm::{Place, Rigid};
 
+use crate::SceneMatch;
 use crate::refine::Sighting;
-
-/// Feature `feature` of a photo shows scene point `point`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) struct SceneMatch {
-    pub feature: u32,
-    pub point: PointId,
-}
 
 /// A photo with its rays under the camera as it is currently believed.
 pub(crate) struct PhotoRays<'a> {

@@ -7,8 +7,8 @@ use setloc_features::squared_distance;
 use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::{PointId, Rigid};
 
-use crate::GuidedParams;
-use crate::evidence::{PhotoRays, SceneMatch};
+use crate::evidence::PhotoRays;
+use crate::{GuidedParams, SceneMatch};
 
 /// Matches between scene points and the photo's features near their projections, sorted by feature.
 ///

@@ -29,12 +29,14 @@ pub use advice::{Link, PathToScene};
 pub use params::{CamsetMethod, CamsetParams, GuidedParams, SingleParams, VerdictParams};
 pub use set::locate_set;
 pub use single::locate_single;
-pub use types::{PhotoLocalization, QueryPhoto, Scene, SetLocalization, Verdict};
+pub use types::{
+    PhotoLocalization, QueryPhoto, Scene, SceneMatch, SetLocalization, SingleLocalization, Verdict,
+};
 
 /// Version of the answers; bumped whenever equal inputs give another answer.
 ///
 /// 1: single photos, rigid sets, joint refinement. 2: moving scene points, baselines, stricter verdicts. 3: exact scene
 /// points hold still, standpoints move together, no pose without scale. 4: noise as the residuals show it. 5: sets by the
 /// places of their pixels. 6: covariances that the points bear out. 7: models mapped and aligned on all cores. 8: each
-/// covariance is asked of its own pose's points.
-pub const VERSION: u32 = 8;
+/// covariance is asked of its own pose's points. 9: sets take over what is known of their photos alone.
+pub const VERSION: u32 = 9;

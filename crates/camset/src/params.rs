@@ -116,8 +116,6 @@ pub struct CamsetParams {
     pub rounds: usize,
     /// Largest angular error of an inlier of the joint refinement, in standard deviations.
     pub max_error_sigmas: f64,
-    /// How photos are localized alone, for comparison and where there is no local model.
-    pub single: SingleParams,
     /// Search around projections once poses are known.
     pub guided: GuidedParams,
     /// When poses may be used.
@@ -134,7 +132,6 @@ impl Default for CamsetParams {
             drift_px: 8.0,
             rounds: 3,
             max_error_sigmas: 4.0,
-            single: SingleParams::default(),
             guided: GuidedParams::default(),
             verdict: VerdictParams::default(),
         }

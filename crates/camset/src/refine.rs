@@ -11,7 +11,8 @@ use setloc_sfm::bundle::{
 };
 use setloc_sfm::{Place, PointId, Rigid};
 
-use crate::evidence::{PhotoRays, SceneMatch};
+use crate::SceneMatch;
+use crate::evidence::PhotoRays;
 use crate::jackknife::honest_covariances;
 
 /// Scale of the robust loss in standard deviations: at one deviation an observation has half its weight, at four (an

@@ -11,9 +11,9 @@ use setloc_index::NearestPoints;
 use setloc_sfm::{ImageId, Reconstruction};
 
 use crate::advice::widest_paths;
-use crate::evidence::SceneMatch;
-use crate::single::locate_with_nearest;
-use crate::{CamsetParams, PhotoLocalization, QueryPhoto, Scene, SetLocalization, Verdict};
+use crate::{
+    CamsetParams, PhotoLocalization, QueryPhoto, Scene, SetLocalization, SingleLocalization, Verdict,
+};
 
 use joint::{Component, ComponentAnswer};
 
@@ -22,20 +22,20 @@ pub(crate) struct PhotoEvidence {
     /// The scene points nearest to each feature.
     nearest: Vec<NearestPoints>,
     /// The photo alone.
-    alone: PhotoLocalization,
-    /// The scene points that it sees from there.
-    seen: Vec<SceneMatch>,
+    alone: SingleLocalization,
 }
 
 /// Localizes a set through its local models (components of the photos' own reconstruction, largest first).
 ///
 /// Image ids of `local_models` are indices into `photos`; models with fewer than two registered photos are left out.
-/// Every photo gets an answer: from the first model that localizes it, else alone. (L. Deng et al., "Image set
-/// querying based localization", VCIP 2015.)
+/// `alone` is what [`locate_single`](crate::locate_single) says of each photo; photos beyond its end count as not
+/// localized. Every photo gets an answer: from the first model that localizes it, else alone. (L. Deng et al., "Image
+/// set querying based localization", VCIP 2015.)
 pub fn locate_set(
     params: &CamsetParams,
     scene: &Scene<'_>,
     photos: &[QueryPhoto<'_>],
+    alone: &[SingleLocalization],
     local_models: &[Reconstruction],
     seed: u64,
 ) -> SetLocalization {
@@ -45,9 +45,8 @@ pub fn locate_set(
         .enumerate()
         .map(|(number, photo)| {
             let nearest = scene.index.nearest_points(&photo.features.descriptors);
-            let seed = seed.wrapping_add(number as u64);
-            let (alone, seen) = locate_with_nearest(&params.single, scene, photo, &nearest, seed);
-            PhotoEvidence { nearest, alone, seen }
+            let not_tried = || SingleLocalization::not_localized(photo, "it was not tried alone");
+            PhotoEvidence { nearest, alone: alone.get(number).cloned().unwrap_or_else(not_tried) }
         })
         .collect();
     let mut answer = SetLocalization::default();
@@ -55,7 +54,7 @@ pub fn locate_set(
     let mut refined: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut scene_links: Vec<usize> = evidence
         .iter()
-        .map(|e| if e.alone.world_from_camera.is_some() { e.alone.inliers } else { 0 })
+        .map(|e| e.alone.photo.world_from_camera.map_or(0, |_| e.alone.photo.inliers))
         .collect();
     let mut photo_links: BTreeMap<(usize, usize), usize> = BTreeMap::new();
     for (number, model) in local_models.iter().enumerate() {
@@ -161,7 +160,7 @@ fn keep_better(kept: &mut Option<PhotoLocalization>, other: PhotoLocalization) {
 /// Answers of the set, and where it has none, those of the photos alone.
 fn or_alone(answers: Vec<Option<PhotoLocalization>>, evidence: &[PhotoEvidence]) -> Vec<PhotoLocalization> {
     let alone = |evidence: &PhotoEvidence| {
-        let mut alone = evidence.alone.clone();
+        let mut alone = evidence.alone.photo.clone();
         let origin = match alone.verdict {
             Verdict::NotLocalized => "neither its local model nor the photo alone is localized",
             _ => "localized alone: no local model of the set leads to it",
@@ -181,12 +180,18 @@ mod tests {
     use nalgebra::Vector3;
 
     use super::*;
-    use crate::CamsetMethod;
     use crate::jackknife::deviation;
     use crate::test_scene::{Place, World, along_street};
+    use crate::{CamsetMethod, SingleParams, locate_single};
+
+    fn alone(scene: &Scene<'_>, photos: &[QueryPhoto<'_>]) -> Vec<SingleLocalization> {
+        photos.iter().map(|photo| locate_single(&SingleParams::default(), scene, photo, 7)).collect()
+    }
 
     fn locate(world: &World, params: &CamsetParams) -> SetLocalization {
-        locate_set(params, &world.scene(), &world.queries(), std::slice::from_ref(&world.local), 7)
+        let (scene, photos) = (world.scene(), world.queries());
+        let local = std::slice::from_ref(&world.local);
+        locate_set(params, &scene, &photos, &alone(&scene, &photos), local, 7)
     }
 
     fn worst_errors(world: &World, photos: &[PhotoLocalization]) -> (f64, f64) {
@@ -283,13 +288,10 @@ mod tests {
         let world = World::chain(5, 0.2, 5);
         for seed in 0..10 {
             let elsewhere = World::chain(5, 0.2, 100 + seed);
-            let found = locate_set(
-                &CamsetParams::default(),
-                &world.scene(),
-                &elsewhere.queries(),
-                std::slice::from_ref(&elsewhere.local),
-                seed,
-            );
+            let (scene, photos) = (world.scene(), elsewhere.queries());
+            let local = std::slice::from_ref(&elsewhere.local);
+            let alone = alone(&scene, &photos);
+            let found = locate_set(&CamsetParams::default(), &scene, &photos, &alone, local, seed);
             for photo in found.rigid.iter().chain(&found.refined) {
                 assert_eq!(photo.verdict, Verdict::NotLocalized, "{seed}: {photo:#?}");
             }
@@ -302,9 +304,10 @@ mod tests {
         let world = World::chain(5, 0.2, 5);
         for seed in 0..4 {
             let elsewhere = World::chain_in(&Place::street(3500, 5).shuffled(seed), 5, 0.2, 300 + seed);
+            let (scene, photos) = (world.scene(), elsewhere.queries());
             let local = std::slice::from_ref(&elsewhere.local);
-            let found =
-                locate_set(&CamsetParams::default(), &world.scene(), &elsewhere.queries(), local, seed);
+            let alone = alone(&scene, &photos);
+            let found = locate_set(&CamsetParams::default(), &scene, &photos, &alone, local, seed);
             for photo in found.rigid.iter().chain(&found.refined) {
                 assert_ne!(photo.verdict, Verdict::Localized, "{seed}: {photo:#?}");
             }
@@ -327,7 +330,9 @@ mod tests {
     #[test]
     fn a_set_without_local_model_is_localized_photo_by_photo() {
         let world = World::chain(3, 0.2, 8);
-        let found = locate_set(&CamsetParams::default(), &world.scene(), &world.queries(), &[], 1);
+        let (scene, photos) = (world.scene(), world.queries());
+        let alone = alone(&scene, &photos);
+        let found = locate_set(&CamsetParams::default(), &scene, &photos, &alone, &[], 1);
         assert!(found.world_from_set.is_empty());
         assert!(
             found.refined.iter().all(|photo| photo.verdict == Verdict::Localized),

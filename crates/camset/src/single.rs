@@ -6,13 +6,11 @@ use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::robust::{RansacParams, estimate_absolute_pose};
 use setloc_sfm::{ImageId, Rigid};
 
-use crate::evidence::{
-    PhotoRays, SceneMatch, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose,
-};
+use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
 use crate::guided::guided_matches;
 use crate::refine::{JointModel, JointObservations, JointPhoto, refine_jointly};
 use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
-use crate::{PhotoLocalization, QueryPhoto, Scene, SingleParams, Verdict};
+use crate::{PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, SingleParams, Verdict};
 
 /// Points in a minimal sample of P3P.
 const SAMPLE: usize = 3;
@@ -41,19 +39,8 @@ pub fn locate_single(
     scene: &Scene<'_>,
     photo: &QueryPhoto<'_>,
     seed: u64,
-) -> PhotoLocalization {
+) -> SingleLocalization {
     let nearest = scene.index.nearest_points(&photo.features.descriptors);
-    locate_with_nearest(params, scene, photo, &nearest, seed).0
-}
-
-/// [`locate_single`] where the nearest scene points of all features are already known, with the matches that agree.
-pub(crate) fn locate_with_nearest(
-    params: &SingleParams,
-    scene: &Scene<'_>,
-    photo: &QueryPhoto<'_>,
-    nearest: &[NearestPoints],
-    seed: u64,
-) -> (PhotoLocalization, Vec<SceneMatch>) {
     // Simulated views tie photos to each other, and help once a pose is known. Before, they add less to a scene of which
     // each point was seen from several sides than the chance matches of so many more features take away.
     let matches: Vec<SceneMatch> = scene
@@ -68,18 +55,18 @@ pub(crate) fn locate_with_nearest(
             matches.len(),
             params.verdict.min_inliers
         );
-        return (PhotoLocalization::not_localized(photo, reason), Vec::new());
+        return SingleLocalization::not_localized(photo, reason);
     }
-    let Some(found) = solve(params, scene, photo, nearest, &matches, seed) else {
+    let Some(found) = solve(params, scene, photo, &nearest, &matches, seed) else {
         let reason = format!("no pose explains any of its {} matches to the scene", matches.len());
-        return (PhotoLocalization::not_localized(photo, reason), Vec::new());
+        return SingleLocalization::not_localized(photo, reason);
     };
     let mut reasons = Vec::new();
     let mut verdict = judge_support(&params.verdict, &found.evidence, &mut reasons);
     if verdict == Verdict::NotLocalized {
-        let mut refused = PhotoLocalization::not_localized(photo, String::new());
-        (refused.reasons, refused.inliers) = (reasons, found.evidence.inliers);
-        return (refused, Vec::new());
+        let mut refused = SingleLocalization::not_localized(photo, String::new());
+        (refused.photo.reasons, refused.photo.inliers) = (reasons, found.evidence.inliers);
+        return refused;
     }
     verdict = weaker(
         verdict,
@@ -94,7 +81,7 @@ pub(crate) fn locate_with_nearest(
         verdict,
         reasons,
     };
-    (answer, found.inliers)
+    SingleLocalization { photo: answer, inliers: found.inliers }
 }
 
 struct Hypothesis {
@@ -330,7 +317,7 @@ mod tests {
     use crate::test_scene::World;
 
     fn locate(world: &World, photo: usize) -> PhotoLocalization {
-        locate_single(&SingleParams::default(), &world.scene(), &world.queries()[photo], 3)
+        locate_single(&SingleParams::default(), &world.scene(), &world.queries()[photo], 3).photo
     }
 
     #[test]
@@ -371,7 +358,7 @@ mod tests {
         guess.params[0] = 640.0;
         guess.params[1] = 640.0;
         let query = QueryPhoto { camera: &guess, camera_fixed: false, ..world.queries()[0] };
-        let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5);
+        let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5).photo;
         assert!((found.camera.params[0] / 800.0 - 1.0).abs() < 0.01, "{:?}", found.camera.params);
         let (center, rotation) = world.errors(0, &found.world_from_camera.unwrap());
         assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
@@ -382,13 +369,14 @@ mod tests {
         let world = World::chain(2, 0.2, 12);
         for seed in 0..10 {
             let elsewhere = World::chain(2, 0.2, 200 + seed);
-            let found =
-                locate_single(&SingleParams::default(), &world.scene(), &elsewhere.queries()[0], seed);
-            assert_eq!(found.verdict, Verdict::NotLocalized);
+            let query = &elsewhere.queries()[0];
+            let found = locate_single(&SingleParams::default(), &world.scene(), query, seed);
+            assert_eq!(found.photo.verdict, Verdict::NotLocalized);
+            assert!(found.inliers.is_empty());
         }
         let empty = setloc_features::ImageFeatures::default();
         let query = QueryPhoto { features: &empty, ..world.queries()[0] };
         let found = locate_single(&SingleParams::default(), &world.scene(), &query, 1);
-        assert_eq!(found.verdict, Verdict::NotLocalized);
+        assert_eq!(found.photo.verdict, Verdict::NotLocalized);
     }
 }

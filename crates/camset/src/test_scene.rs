@@ -11,8 +11,7 @@ use setloc_sfm::{
     ReconstructionPoint, Rigid, Similarity,
 };
 
-use crate::evidence::SceneMatch;
-use crate::{QueryPhoto, Scene};
+use crate::{QueryPhoto, Scene, SceneMatch};
 
 const NOISE_PX: f64 = 0.5;
 const VISIBLE: f64 = 35.0;

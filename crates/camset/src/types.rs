@@ -2,7 +2,7 @@ use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, ImageFeatures};
 use setloc_index::SceneIndex;
-use setloc_sfm::{Reconstruction, Rigid, Similarity};
+use setloc_sfm::{PointId, Reconstruction, Rigid, Similarity};
 
 use crate::PathToScene;
 
@@ -82,6 +82,31 @@ impl PhotoLocalization {
             verdict: Verdict::NotLocalized,
             reasons: vec![reason.into()],
         }
+    }
+}
+
+/// A feature of a photo that shows a scene point.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct SceneMatch {
+    /// Index of the feature in the photo.
+    pub feature: u32,
+    /// The scene point.
+    pub point: PointId,
+}
+
+/// Where one photo is by itself, and what says so.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SingleLocalization {
+    /// The answer.
+    pub photo: PhotoLocalization,
+    /// The scene points that it sees from there; empty when not localized.
+    pub inliers: Vec<SceneMatch>,
+}
+
+impl SingleLocalization {
+    /// The answer "not localized", for one reason.
+    pub fn not_localized(photo: &QueryPhoto<'_>, reason: impl Into<String>) -> Self {
+        Self { photo: PhotoLocalization::not_localized(photo, reason), inliers: Vec::new() }
     }
 }
 

@@ -1,7 +1,7 @@
 //! What the jobs hand on, as files.
 
 use serde::{Deserialize, Serialize};
-use setloc_camset::{PhotoLocalization, SetLocalization};
+use setloc_camset::{SetLocalization, SingleLocalization};
 use setloc_features::{ImageFeatures, Keypoint, Match, SimulatedView};
 use setloc_index::SceneIndex;
 use setloc_sfm::{MapperOutput, TwoView};
@@ -107,5 +107,5 @@ pub struct VerifiedPair(pub Vec<TwoView>);
 serde_artifact!(VerifiedPair, "verified pair", 1);
 serde_artifact!(MapperOutput, "model", 3);
 serde_artifact!(SceneIndex, "index", 1);
-serde_artifact!(PhotoLocalization, "photo localization", 1);
+serde_artifact!(SingleLocalization, "photo localization", 2);
 serde_artifact!(SetLocalization, "set localization", 1);

@@ -15,6 +15,8 @@ pub struct Digest {
     pub headline: String,
     /// What looks wrong or weak.
     pub warnings: Vec<String>,
+    /// What is worth knowing: parts that were joined, what the index misses.
+    pub notes: Vec<String>,
     /// What to do better.
     pub advice: Vec<String>,
     /// One row an image.

@@ -6,7 +6,7 @@ mod model;
 mod pairs;
 mod scene;
 
-pub use locate::{LocateJobs, SetJobs, add_set, add_single};
+pub use locate::{LocateJobs, SetJobs, add_set, add_singles};
 pub use model::{ModelJobs, ModelKind, add_features_of, add_model};
 pub use pairs::choose_pairs;
 pub use scene::{SceneJobs, add_scene};

@@ -3,12 +3,12 @@
 use std::collections::BTreeMap;
 
 use anyhow::Result;
-use setloc_camset::{PhotoLocalization, SetLocalization, Verdict};
+use setloc_camset::{PhotoLocalization, SetLocalization, SingleLocalization, Verdict};
 use setloc_sfm::MapperOutput;
 
 use crate::dataset::{ImageFolder, SkippedImage};
-use crate::graph::{JobGraph, RunResult};
-use crate::jobs::{LocateJobs, add_features_of, add_set, add_single};
+use crate::graph::{JobGraph, JobId, RunResult};
+use crate::jobs::{LocateJobs, add_features_of, add_set, add_singles};
 use crate::session::Session;
 
 /// Which methods are tried.
@@ -106,12 +106,10 @@ fn run(
         Some(set) => set.model.features.clone(),
         None => add_features_of(&mut graph, &folder.images, &what.config.photo_features()),
     };
-    let mut single = Vec::new();
-    if alone {
-        single.extend(
-            folder.images.iter().zip(&features).map(|(photo, job)| add_single(&mut graph, photo, *job, what)),
-        );
-    }
+    let single: Vec<JobId> = match &set {
+        Some(set) => set.single.clone(),
+        None => add_singles(&mut graph, &folder.images, &features, what),
+    };
     session.run(name, &graph, |executor, result| {
         for (photo, job) in folder.images.iter().zip(&features) {
             let known = located.skipped.iter().any(|skipped| skipped.name == photo.name);
@@ -119,9 +117,9 @@ fn run(
                 located.skipped.push(SkippedImage { name: photo.name.clone(), reason: reason.clone() });
             }
         }
-        for job in &single {
+        for job in single.iter().filter(|_| alone) {
             if executor.output(*job).is_some() {
-                located.single.push((*executor.load::<PhotoLocalization>(*job)?).clone());
+                located.single.push(executor.load::<SingleLocalization>(*job)?.photo.clone());
             }
         }
         if let Some(set) = set.filter(|set| executor.output(set.set).is_some()) {

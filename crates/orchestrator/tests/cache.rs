@@ -110,7 +110,7 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
         build_and_locate(folder.path(), &Config::resolve(None, &settings).unwrap())
     };
     assert_eq!(after(&["camset.ratio=0.65"]), ["camset lane/img_03.jpg"]);
-    assert_eq!(kinds(&after(&["single.ratio=0.65"])), BTreeSet::from(["single"]));
+    assert_eq!(kinds(&after(&["single.ratio=0.65"])), BTreeSet::from(["single", "camset"]));
     let bundle = after(&["sfm.loss_sigma=1.5"]);
     assert_eq!(
         kinds(&bundle),

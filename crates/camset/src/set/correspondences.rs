@@ -67,8 +67,8 @@ pub(crate) fn correspondences(
     }
     // What a photo that is localized alone sees has been confirmed by its pose, the ratio test or not.
     for (slot, &photo) in members.iter().enumerate() {
-        let PhotoEvidence { alone, seen, .. } = &evidence[photo];
-        for seen in seen.iter().filter(|_| alone.verdict == Verdict::Localized) {
+        let alone = &evidence[photo].alone;
+        for seen in alone.inliers.iter().filter(|_| alone.photo.verdict == Verdict::Localized) {
             if used.insert(seen.point) {
                 let seen_by = vec![(slot, seen.feature)];
                 found.push(SetCorrespondence { scene: seen.point, local: None, seen_by });

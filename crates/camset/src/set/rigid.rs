@@ -47,10 +47,10 @@ pub(crate) fn rigid_pose(
     candidates.extend(alignments(set_from_camera, members, evidence));
     for (slot, &photo) in members.iter().enumerate() {
         let in_set = &set_from_camera[slot];
-        let alone = evidence[photo]
-            .alone
-            .world_from_camera
-            .map(|in_world| Rigid::new(in_world.rotation * in_set.rotation.inverse(), in_world.translation));
+        let alone =
+            evidence[photo].alone.photo.world_from_camera.map(|in_world| {
+                Rigid::new(in_world.rotation * in_set.rotation.inverse(), in_world.translation)
+            });
         let view = rays.of_slot(slot);
         let sampled = view.absolute_pose(params, seed.wrapping_add(slot as u64));
         for axes_at_photo in alone.into_iter().chain(sampled) {
@@ -263,8 +263,8 @@ fn alignments(set_from_camera: &[Rigid], members: &[usize], evidence: &[PhotoEvi
     let alone: Vec<(Rigid, Rigid)> = members
         .iter()
         .zip(set_from_camera)
-        .filter(|(photo, _)| evidence[**photo].alone.verdict == Verdict::Localized)
-        .filter_map(|(&photo, &in_set)| Some((in_set, evidence[photo].alone.world_from_camera?)))
+        .filter(|(photo, _)| evidence[**photo].alone.photo.verdict == Verdict::Localized)
+        .filter_map(|(&photo, &in_set)| Some((in_set, evidence[photo].alone.photo.world_from_camera?)))
         .collect();
     let mut found = Vec::new();
     for (i, (first_in_set, first_in_world)) in alone.iter().enumerate() {

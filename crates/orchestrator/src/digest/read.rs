@@ -25,6 +25,8 @@ enum Poses {
 struct ScenePoses {
     components: Vec<Component>,
     warnings: Vec<String>,
+    #[serde(default)]
+    notes: Vec<String>,
 }
 
 #[derive(Deserialize)]
@@ -115,6 +117,7 @@ fn of_scene(name: &str, scene: ScenePoses, skipped: Vec<SkippedImage>) -> Digest
             title: format!("Scene {name}"),
             headline: "No image could be registered.".to_owned(),
             warnings: scene.warnings,
+            notes: scene.notes,
             advice: vec!["take panoramas closer to each other (3 to 10 m)".to_owned()],
             skipped,
             ..Digest::default()
@@ -168,6 +171,7 @@ fn of_scene(name: &str, scene: ScenePoses, skipped: Vec<SkippedImage>) -> Digest
             main.observations
         ),
         warnings: scene.warnings,
+        notes: scene.notes,
         advice,
         images,
         skipped,

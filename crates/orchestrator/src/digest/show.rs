@@ -19,7 +19,7 @@ impl Digest {
             }
             text.push('\n');
         }
-        for (word, lines) in [("warning", &self.warnings), ("advice", &self.advice)] {
+        for (word, lines) in [("warning", &self.warnings), ("note", &self.notes), ("advice", &self.advice)] {
             for line in lines {
                 add(&mut text, format_args!("{word}: {line}\n"));
             }
@@ -33,7 +33,8 @@ impl Digest {
     /// One page without anything outside it.
     pub fn to_html(&self) -> String {
         let mut body = format!("<p><b>{}</b></p>\n", escape(&self.headline));
-        for (title, lines) in [("Warnings", &self.warnings), ("Advice", &self.advice)] {
+        for (title, lines) in [("Warnings", &self.warnings), ("Notes", &self.notes), ("Advice", &self.advice)]
+        {
             if !lines.is_empty() {
                 add(&mut body, format_args!("<h2>{title}</h2>\n<ul>"));
                 for line in lines {

@@ -1,9 +1,9 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 use serde_json::json;
-use setloc_camset::{QueryPhoto, Scene, SetLocalization, locate_set, locate_single};
+use setloc_camset::{QueryPhoto, Scene, SetLocalization, SingleLocalization, locate_set, locate_single};
 use setloc_features::ImageFeatures;
 use setloc_sfm::{MapperOutput, Reconstruction};
 
@@ -31,11 +31,13 @@ pub struct LocateJobs {
 pub struct SetJobs {
     /// Features and local model.
     pub model: ModelJobs,
+    /// Each photo alone, in the order of the photos.
+    pub single: Vec<JobId>,
     /// The set's localization.
     pub set: JobId,
 }
 
-/// Adds features, matches, local model and localization of a set; `name` is what its jobs are called.
+/// Adds features, matches, local model, localization of each photo alone and of the set; `name` is what its jobs are called.
 ///
 /// # Errors
 /// When parameters have no JSON form.
@@ -49,6 +51,7 @@ pub fn add_set(
     let pairs = choose_pairs(&what.config.pairs, &positions);
     let source = ModelSource { images: photos, positions: &positions, pairs: &pairs };
     let model = add_model(graph, ModelKind::Local, name, source, &what.config, what.seed)?;
+    let single = add_singles(graph, photos, &model.features, what);
     let listed: Vec<_> = photos.iter().map(|p| json!([p.name, p.camera, p.camera_fixed])).collect();
     let params = json!({ "camset": what.config.camset, "seed": what.seed, "photos": listed });
     let (owned, what_here) = (photos.to_vec(), what.clone());
@@ -63,37 +66,45 @@ pub fn add_set(
         work: Box::new(work),
     });
     graph.require(set, "local_model", model.model);
-    for (at, features) in model.features.iter().enumerate() {
+    for (at, (features, single)) in model.features.iter().zip(&single).enumerate() {
         graph.accept(set, format!("features {at:04}"), *features);
+        graph.accept(set, format!("single {at:04}"), *single);
     }
-    Ok(SetJobs { model, set })
+    Ok(SetJobs { model, single, set })
 }
 
 fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -> Result<Product> {
     let model = inputs.get::<MapperOutput>("local_model")?;
-    let mut features = Vec::new();
+    let (mut features, mut alone) = (Vec::new(), Vec::new());
     for (at, photo) in photos.iter().enumerate() {
         // The local model has the same images in the same order: those whose features exist.
-        if let Some(found) = inputs.find::<ImageFeatures>(&format!("features {at:04}"))? {
-            features.push((photo, found));
-        }
+        let Some(found) = inputs.find::<ImageFeatures>(&format!("features {at:04}"))? else { continue };
+        features.push((photo, found));
+        let by_itself = inputs.find::<SingleLocalization>(&format!("single {at:04}"))?;
+        alone.push(by_itself.with_context(|| format!("{} was not located alone", photo.name))?);
     }
+    let alone: Vec<SingleLocalization> = alone.iter().map(|found| (**found).clone()).collect();
     let queries: Vec<QueryPhoto<'_>> =
         features.iter().map(|(photo, features)| query(photo, features)).collect();
     let empty = Reconstruction::default();
     let scene = scene_of(&what.scene, &empty);
     let seed = derived_seed(what.seed, &["camset"]);
-    let located: SetLocalization = locate_set(&what.config.camset, &scene, &queries, &model.components, seed);
+    let located: SetLocalization =
+        locate_set(&what.config.camset, &scene, &queries, &alone, &model.components, seed);
     Product::new(located)
 }
 
-/// Adds the localization of one photo alone, from its features.
-pub fn add_single(
+/// Adds the localization of each photo alone, from its features.
+pub fn add_singles(
     graph: &mut JobGraph<'_>,
-    photo: &SourceImage,
-    features: JobId,
+    photos: &[SourceImage],
+    features: &[JobId],
     what: &LocateJobs,
-) -> JobId {
+) -> Vec<JobId> {
+    photos.iter().zip(features).map(|(photo, features)| add_single(graph, photo, *features, what)).collect()
+}
+
+fn add_single(graph: &mut JobGraph<'_>, photo: &SourceImage, features: JobId, what: &LocateJobs) -> JobId {
     let camera = json!([photo.name, photo.camera, photo.camera_fixed]);
     let params = json!({ "single": what.config.single, "seed": what.seed, "photo": camera });
     let (owned, what_here) = (photo.clone(), what.clone());
