@@ -77,6 +77,8 @@ struct Slot {
     key: Option<ContentHash>,
     output: Option<ContentHash>,
     value: Option<Arc<dyn Any + Send + Sync>>,
+    /// The result's file, where it was made and the caller will ask for it.
+    file: Option<Arc<Vec<u8>>>,
     /// Users that have not finished; the value is dropped from memory after the last.
     users_left: usize,
     dependencies_left: usize,
@@ -108,7 +110,7 @@ struct Unkept {
     id: JobId,
     fingerprint: Fingerprint,
     output: ContentHash,
-    file: Vec<u8>,
+    file: Arc<Vec<u8>>,
     started_secs: f64,
     wall_secs: f64,
     cpu_secs: f64,
@@ -157,6 +159,7 @@ impl<'a> Executor<'a> {
                 key: None,
                 output: None,
                 value: None,
+                file: None,
                 users_left: graph.user_count(id),
                 dependencies_left: graph.uses(id).count(),
             })
@@ -179,6 +182,16 @@ impl<'a> Executor<'a> {
     /// # Errors
     /// When stopped, or when the store cannot be written. A failing job is no error: see [`RunResult::failed`].
     pub fn run(&self) -> Result<RunResult> {
+        self.run_with(|_| ()).map(|(result, ())| result)
+    }
+
+    /// Runs all jobs; `meanwhile` gets the results while the last of them are still being kept.
+    ///
+    /// What it loads must be in memory or have been stored before: see [`JobGraph::want`].
+    ///
+    /// # Errors
+    /// As [`Executor::run`]. `meanwhile` may have been called when what it was given could not be kept.
+    pub fn run_with<R>(&self, meanwhile: impl FnOnce(&RunResult) -> R) -> Result<(RunResult, R)> {
         let mut jobs = BTreeMap::new();
         for id in self.graph.graph.node_indices() {
             *jobs.entry(self.graph.job(id).kind.to_owned()).or_insert(0) += 1;
@@ -187,21 +200,20 @@ impl<'a> Executor<'a> {
         // Syncing a file to the disk takes as long as many a job does, and no core: it is done beside the jobs.
         let (keep, unkept) = sync_channel(MOST_WAITING);
         let unkept = Mutex::new(unkept);
-        std::thread::scope(|threads| {
+        let used = std::thread::scope(|threads| {
             for _ in 0..KEEPERS {
                 threads.spawn(|| self.keep_results(&unkept));
             }
             rayon::scope(|scope| self.pump(scope, &keep));
             drop(keep);
+            let ended_early = self.lock().fatal.is_some() || self.options.stop.load(Ordering::Relaxed);
+            (!ended_early).then(|| meanwhile(&self.result()))
         });
         self.options.observer.notice(&Event::Ended);
         if let Some(error) = self.lock().fatal.take() {
             return Err(error);
         }
-        if self.options.stop.load(Ordering::Relaxed) {
-            return Err(Interrupted.into());
-        }
-        Ok(self.result())
+        used.map(|used| (self.result(), used)).ok_or_else(|| Interrupted.into())
     }
 
     /// What the jobs came to so far.
@@ -380,10 +392,13 @@ impl<'a> Executor<'a> {
         let wall_secs = wall.elapsed().as_secs_f64();
         self.running.fetch_sub(1, Ordering::SeqCst);
         let Product { value, file } = product?;
-        let output = ContentHash::of(&file);
+        let (output, file) = (ContentHash::of(&file), Arc::new(file));
         let slot = &mut self.lock().slots[id.index()];
         if slot.users_left > 0 {
             slot.value = Some(value);
+        }
+        if self.graph.wants_file(id) {
+            slot.file = Some(Arc::clone(&file));
         }
         Ok(Unkept { id, fingerprint, output, file, started_secs, wall_secs, cpu_secs })
     }
@@ -424,13 +439,16 @@ impl<'a> Executor<'a> {
     ///
     /// # Errors
     /// As [`Executor::load`].
-    pub fn file<T: Artifact>(&self, id: JobId) -> Result<Vec<u8>> {
-        let (key, output) = {
+    pub fn file<T: Artifact>(&self, id: JobId) -> Result<Arc<Vec<u8>>> {
+        let (file, key, output) = {
             let slot = &self.lock().slots[id.index()];
-            (slot.key, slot.output)
+            (slot.file.clone(), slot.key, slot.output)
         };
+        if let Some(file) = file {
+            return Ok(file);
+        }
         let stored = key.zip(output).and_then(|(key, output)| self.options.store.read(key, output).ok());
-        stored.map_or_else(|| Ok(codec::encode(&*self.load::<T>(id)?)?), Ok)
+        stored.map_or_else(|| Ok(codec::encode(&*self.load::<T>(id)?)?), Ok).map(Arc::new)
     }
 
     fn keep(&self, id: JobId, value: Arc<dyn Any + Send + Sync>) -> Arc<dyn Any + Send + Sync> {
