@@ -3,13 +3,13 @@
 use std::any::Any;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 
 use super::events::{Event, Observer};
+use super::gathering::{Gathering, Limits};
 use super::job::{Inputs, JobGraph, JobId, Product};
 use crate::clock;
 use crate::codec::{self, Artifact};
@@ -92,18 +92,13 @@ struct Shared {
     fatal: Option<anyhow::Error>,
 }
 
-/// Results that may wait to be kept; further ones hold up the jobs that made them.
-const MOST_WAITING: usize = 16;
-
 /// Threads that keep results. They wait for the disk most of the time, and file systems sync several files at once for
 /// the price of one.
 const KEEPERS: usize = 4;
 
-/// How long a small result waits for others that are kept with it: what a kill may cost, against a file for each.
-const GATHERING: Duration = Duration::from_millis(100);
-
-/// Bytes of results that wait for no others.
-const ENOUGH_BYTES: usize = 1 << 18;
+/// What may wait to be kept: what a kill may cost, against a file of records for each result.
+const KEEPING: Limits =
+    Limits { time: Duration::from_millis(250), enough_bytes: 4 << 20, most_bytes: 32 << 20 };
 
 /// The result of a job on its way to the store.
 struct Unkept {
@@ -121,20 +116,6 @@ impl Unkept {
         let Self { fingerprint, output, file, cpu_secs, .. } = self;
         Output { fingerprint, hash: *output, file, cpu_secs: *cpu_secs }
     }
-}
-
-/// The next results to be kept at once: small ones that come soon after each other; none when no more will come.
-fn next_together(unkept: &Receiver<Unkept>) -> Vec<Unkept> {
-    let Ok(first) = unkept.recv() else { return Vec::new() };
-    let until = Instant::now() + GATHERING;
-    let (mut bytes, mut together) = (first.file.len(), vec![first]);
-    while bytes < ENOUGH_BYTES
-        && let Ok(next) = unkept.recv_timeout(until.saturating_duration_since(Instant::now()))
-    {
-        bytes += next.file.len();
-        together.push(next);
-    }
-    together
 }
 
 /// A graph being run.
@@ -198,14 +179,14 @@ impl<'a> Executor<'a> {
         }
         self.options.observer.notice(&Event::Planned { jobs });
         // Syncing a file to the disk takes as long as many a job does, and no core: it is done beside the jobs.
-        let (keep, unkept) = sync_channel(MOST_WAITING);
-        let unkept = Mutex::new(unkept);
+        let unkept = Gathering::new(KEEPING);
         let used = std::thread::scope(|threads| {
+            let open = unkept.open();
             for _ in 0..KEEPERS {
                 threads.spawn(|| self.keep_results(&unkept));
             }
-            rayon::scope(|scope| self.pump(scope, &keep));
-            drop(keep);
+            rayon::scope(|scope| self.pump(scope, &unkept));
+            drop(open);
             let ended_early = self.lock().fatal.is_some() || self.options.stop.load(Ordering::Relaxed);
             (!ended_early).then(|| meanwhile(&self.result()))
         });
@@ -237,7 +218,7 @@ impl<'a> Executor<'a> {
     }
 
     /// Starts as many ready jobs as threads and memory allow, in the order they were added.
-    fn pump<'s>(&'s self, scope: &rayon::Scope<'s>, keep: &'s SyncSender<Unkept>) {
+    fn pump<'s>(&'s self, scope: &rayon::Scope<'s>, unkept: &'s Gathering<Unkept>) {
         loop {
             let mut shared = self.lock();
             let stopped = self.options.stop.load(Ordering::Relaxed) || shared.fatal.is_some();
@@ -254,21 +235,21 @@ impl<'a> Executor<'a> {
             shared.memory_in_flight += self.graph.job(id).memory;
             drop(shared);
             scope.spawn(move |scope| {
-                self.settle(id, keep);
-                self.pump(scope, keep);
+                self.settle(id, unkept);
+                self.pump(scope, unkept);
             });
         }
     }
 
     /// Decides one job and frees those that waited for it.
-    fn settle(&self, id: JobId, keep: &SyncSender<Unkept>) {
+    fn settle(&self, id: JobId, unkept: &Gathering<Unkept>) {
         let job = self.graph.job(id);
         let lacking = self.graph.uses(id).any(|(used, edge)| edge.required && self.output(used).is_none());
         let (state, key, output) = if lacking {
             self.options.observer.notice(&Event::Skipped { kind: job.kind, job: job.name.clone() });
             (State::Skipped, None, None)
         } else {
-            self.decide(id, keep)
+            self.decide(id, unkept)
         };
         let mut shared = self.lock();
         shared.in_flight -= 1;
@@ -298,7 +279,7 @@ impl<'a> Executor<'a> {
     fn decide(
         &self,
         id: JobId,
-        keep: &SyncSender<Unkept>,
+        unkept: &Gathering<Unkept>,
     ) -> (State, Option<ContentHash>, Option<ContentHash>) {
         let job = self.graph.job(id);
         let fingerprint = self.fingerprint(id);
@@ -309,9 +290,8 @@ impl<'a> Executor<'a> {
         }
         match self.execute(id, fingerprint) {
             Ok(made) => {
-                let output = made.output;
-                // The receiver lives as long as any job runs.
-                let _ = keep.send(made);
+                let (output, bytes) = (made.output, made.file.len());
+                unkept.add(made, bytes);
                 (State::Ran, Some(key), Some(output))
             }
             Err(error) => (self.failed(id, &error), Some(key), None),
@@ -327,9 +307,9 @@ impl<'a> Executor<'a> {
     }
 
     /// Stores results until no job is left that could send one.
-    fn keep_results(&self, unkept: &Mutex<Receiver<Unkept>>) {
+    fn keep_results(&self, unkept: &Gathering<Unkept>) {
         loop {
-            let together = next_together(&unkept.lock().unwrap_or_else(PoisonError::into_inner));
+            let together = unkept.next();
             if together.is_empty() {
                 return;
             }
