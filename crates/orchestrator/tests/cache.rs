@@ -69,7 +69,8 @@ fn build_and_locate(folder: &Path, config: &Config) -> Vec<String> {
         let files = list_images(&[town.join(part)]).unwrap();
         ImageFolder::read(&files, &cameras, &GeoSource::None, None).unwrap()
     };
-    let built = match build_scene(&session, &read("panoramas"), config, 7, "scene", None, |_| Ok(())).unwrap() {
+    let built = match build_scene(&session, &read("panoramas"), config, 7, "scene", None, |_| Ok(())).unwrap()
+    {
         BuildOutcome::Built(built) => built,
         BuildOutcome::Unchanged(..) => panic!("no present hash was given"),
     };

@@ -41,8 +41,7 @@ impl<T> Gathering<T> {
     /// Adds an item of so many bytes; waits while too much waits.
     pub fn add(&self, item: T, bytes: usize) {
         let is_full = |waiting: &mut Waiting<T>| waiting.bytes >= self.limits.most_bytes;
-        let mut waiting =
-            self.goes.wait_while(self.lock(), is_full).unwrap_or_else(PoisonError::into_inner);
+        let mut waiting = self.goes.wait_while(self.lock(), is_full).unwrap_or_else(PoisonError::into_inner);
         if waiting.items.is_empty() {
             waiting.since = Instant::now();
             self.comes.notify_one();

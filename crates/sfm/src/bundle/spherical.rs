@@ -229,8 +229,7 @@ impl Spherical {
         in_order()
             .map(|&index| (link(&problem.observations[index as usize]), given[index as usize]))
             .unzip_into_vecs(&mut links, &mut rays);
-        let pixel_rays =
-            if intrinsics.is_empty() { Vec::new() } else { in_order().map(pixel_ray).collect() };
+        let pixel_rays = if intrinsics.is_empty() { Vec::new() } else { in_order().map(pixel_ray).collect() };
 
         let poses: Vec<_> = problem.poses.iter().map(|pose| PoseState::new(pose.world_from_camera)).collect();
         let structure = Structure {
