@@ -20,10 +20,14 @@ pub fn ply(model: &Reconstruction, cameras: &[(Vector3<f64>, [u8; 3])]) -> Strin
     };
     let pieces = model.points.par_chunks(POINTS_OF_PIECE).map(|points| {
         let mut lines = String::new();
-        points.iter().for_each(|point| line(&mut lines, (point.position, point.color)));
+        for point in points {
+            line(&mut lines, (point.position, point.color));
+        }
         lines
     });
     text.extend(pieces.collect::<Vec<_>>());
-    cameras.iter().for_each(|camera| line(&mut text, *camera));
+    for camera in cameras {
+        line(&mut text, *camera);
+    }
     text
 }
