@@ -301,8 +301,8 @@ impl<const D: usize> NormalEquations<D> {
 
     /// Builds H and g at the current state and eliminates the points for damping λ; returns the cost.
     ///
-    /// [`NormalEquations::factorize`] does the latter for any λ, but each call to other threads takes as long as
-    /// hundreds of points do: small problems go through their points as few times as possible.
+    /// [`NormalEquations::factorize`] does the latter for any λ, but waking other threads takes as long as many points
+    /// do: small problems are handed out as few times as possible.
     pub fn linearize<M: Model<D>>(&mut self, model: &M, lambda: f64) -> f64 {
         let Self {
             links, targets, observation_starts, points, couplings, block_count, pattern, chunks, ..
