@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use setloc_features::{DESCRIPTOR_LEN, ImageFeatures, squared_distance};
-use setloc_sfm::{ImageId, PointId, Reconstruction};
+use setloc_sfm::{ImageId, Observation, PointId, Reconstruction, ReconstructionPoint};
 
 use crate::search::{InvertedLists, PrincipalTree, Search, nearest_exact, scan_rows};
 use crate::{Backend, IndexParams, NearestPoints};
@@ -13,8 +13,10 @@ use crate::{Backend, IndexParams, NearestPoints};
 /// Queries that share one pass over the rows.
 const TILE_QUERIES: usize = 64;
 
-/// Queries of the recall's measurement that are worth handing to another thread.
+/// Queries of the recall's measurement that are worth handing to another thread; exact ones are one by one.
 const QUERIES_PER_TASK: usize = 8;
+/// Points, or rows, of which the descriptors are gathered at once.
+const GATHERED_AT_ONCE: usize = 4096;
 
 /// One observation of a scene point.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -37,6 +39,7 @@ pub struct SceneIndex {
     centers: Vec<Option<Vector3<f64>>>,
     rows: Vec<Row>,
     /// Row-major, one descriptor a row.
+    #[serde(with = "crate::bytes")]
     descriptors: Vec<u8>,
     /// Rows of point `p`: `point_rows[point_starts[p] .. point_starts[p + 1]]`.
     point_starts: Vec<u32>,
@@ -50,51 +53,28 @@ impl SceneIndex {
     ///
     /// Observations whose image or keypoint is not in `features` are left out.
     pub fn build(params: &IndexParams, reconstruction: &Reconstruction, features: &[&ImageFeatures]) -> Self {
-        let mut rows = Vec::with_capacity(reconstruction.observation_count());
-        let mut descriptors = Vec::with_capacity(rows.capacity() * DESCRIPTOR_LEN);
-        let mut information = vec![Matrix3::zeros(); reconstruction.points.len()];
-        for (point_index, point) in reconstruction.points.iter().enumerate() {
-            for observation in &point.track {
-                let image = observation.image;
-                let feature = observation.feature as usize;
-                let Some(image_features) = features.get(image.index()).filter(|f| feature < f.len()) else {
-                    continue;
-                };
-                let Some(pose) = reconstruction.images.get(image.index()).and_then(|i| i.world_from_camera)
-                else {
-                    continue;
-                };
-                let keypoint = &image_features.keypoints[feature];
-                let angle = reconstruction.camera_of(image).pixel_angle(&keypoint.pixel()).unwrap_or(0.0);
-                let offset = point.position - pose.translation;
-                let distance = offset.norm();
-                let sigma = angle * f64::from(keypoint.noise_px) * distance;
-                if sigma > 0.0 && sigma.is_finite() {
-                    let direction = offset / distance;
-                    information[point_index] +=
-                        (Matrix3::identity() - direction * direction.transpose()) / (sigma * sigma);
-                }
-                let extent = (f64::from(keypoint.size) * angle * distance) as f32;
-                rows.push(Row { point: PointId(point_index as u32), image, extent });
-                descriptors.extend_from_slice(image_features.descriptor(feature));
-            }
-        }
+        let points: Vec<(PointId, &ReconstructionPoint)> =
+            (0..).map(PointId).zip(&reconstruction.points).collect();
+        let parts: Vec<Gathered> = points
+            .par_chunks(GATHERED_AT_ONCE)
+            .with_max_len(1)
+            .map(|points| gathered(reconstruction, features, points))
+            .collect();
+        let rows: Vec<(Row, u32)> = parts.iter().flat_map(|part| &part.rows).copied().collect();
+        let descriptor = |row: usize| {
+            let (Row { image, .. }, feature) = rows[row];
+            features[image.index()].descriptor(feature as usize)
+        };
         let mut index = Self {
             positions: reconstruction.points.iter().map(|point| point.position).collect(),
-            covariances: information
-                .iter()
-                .zip(&reconstruction.points)
-                .map(|(information, point)| {
-                    point.covariance.unwrap_or_else(|| position_covariance(information))
-                })
-                .collect(),
+            covariances: parts.iter().flat_map(|part| &part.covariances).copied().collect(),
             centers: reconstruction
                 .images
                 .iter()
                 .map(|i| i.world_from_camera.map(|pose| pose.translation))
                 .collect(),
-            rows,
-            descriptors,
+            descriptors: descriptors_of(rows.len(), descriptor),
+            rows: rows.into_iter().map(|(row, _)| row).collect(),
             ..Self::default()
         };
         index.prepare_search(params);
@@ -112,7 +92,7 @@ impl SceneIndex {
             Backend::Inverted => {
                 let (lists, order) = InvertedLists::train(&self.descriptors, params.seed);
                 self.rows = order.iter().map(|&row| self.rows[row as usize]).collect();
-                self.descriptors = order.iter().flat_map(|&row| self.descriptor(row)).copied().collect();
+                self.descriptors = descriptors_of(order.len(), |row| self.descriptor(order[row]));
                 self.search = Search::Inverted(lists);
             }
             Backend::Kiddo => self.search = Search::Kiddo(PrincipalTree::train(&self.descriptors)),
@@ -134,7 +114,7 @@ impl SceneIndex {
             index::sample(&mut rng, self.rows.len(), amount).iter().map(|row| row as u32).collect();
         let truth: Vec<NearestPoints> = queries
             .par_iter()
-            .with_max_len(QUERIES_PER_TASK)
+            .with_max_len(1)
             .map(|&row| self.nearest_among(row, 0..self.rows.len() as u32))
             .collect();
         loop {
@@ -197,7 +177,7 @@ impl SceneIndex {
             starts[point] += starts[point - 1];
         }
         let mut order: Vec<u32> = (0..self.rows.len() as u32).collect();
-        order.sort_by_key(|&row| (self.rows[row as usize].point, self.rows[row as usize].image));
+        order.par_sort_by_key(|&row| (self.rows[row as usize].point, self.rows[row as usize].image));
         self.point_starts = starts;
         self.point_rows = order;
     }
@@ -306,6 +286,56 @@ impl SceneIndex {
                 .collect(),
         }
     }
+}
+
+/// What an index holds of some consecutive points.
+struct Gathered {
+    covariances: Vec<Matrix3<f32>>,
+    /// Each with the keypoint in its image.
+    rows: Vec<(Row, u32)>,
+}
+
+fn gathered(
+    reconstruction: &Reconstruction,
+    features: &[&ImageFeatures],
+    points: &[(PointId, &ReconstructionPoint)],
+) -> Gathered {
+    let mut gathered = Gathered { covariances: Vec::with_capacity(points.len()), rows: Vec::new() };
+    for &(id, point) in points {
+        let mut information = Matrix3::zeros();
+        for &Observation { image, feature } in &point.track {
+            let found = features.get(image.index()).filter(|features| (feature as usize) < features.len());
+            let Some(image_features) = found else { continue };
+            let Some(pose) = reconstruction.images.get(image.index()).and_then(|i| i.world_from_camera)
+            else {
+                continue;
+            };
+            let keypoint = &image_features.keypoints[feature as usize];
+            let angle = reconstruction.camera_of(image).pixel_angle(&keypoint.pixel()).unwrap_or(0.0);
+            let offset = point.position - pose.translation;
+            let distance = offset.norm();
+            let sigma = angle * f64::from(keypoint.noise_px) * distance;
+            if sigma > 0.0 && sigma.is_finite() {
+                let direction = offset / distance;
+                information += (Matrix3::identity() - direction * direction.transpose()) / (sigma * sigma);
+            }
+            let extent = (f64::from(keypoint.size) * angle * distance) as f32;
+            gathered.rows.push((Row { point: id, image, extent }, feature));
+        }
+        gathered.covariances.push(point.covariance.unwrap_or_else(|| position_covariance(&information)));
+    }
+    gathered
+}
+
+/// Row-major descriptors.
+fn descriptors_of<'d>(rows: usize, descriptor: impl Fn(usize) -> &'d [u8] + Sync) -> Vec<u8> {
+    let mut all = vec![0; rows * DESCRIPTOR_LEN];
+    all.par_chunks_mut(GATHERED_AT_ONCE * DESCRIPTOR_LEN).enumerate().for_each(|(part, to)| {
+        for (row, to) in to.chunks_exact_mut(DESCRIPTOR_LEN).enumerate() {
+            to.copy_from_slice(descriptor(part * GATHERED_AT_ONCE + row));
+        }
+    });
+    all
 }
 
 /// Inverse of a position's information, regularized where rays are (nearly) parallel.

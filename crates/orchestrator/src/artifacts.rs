@@ -14,9 +14,9 @@ impl Artifact for ImageFeatures {
     const KIND: &'static str = "features";
     const SCHEMA: u32 = 3;
 
-    fn to_payload(&self) -> Result<Vec<u8>, CodecError> {
+    fn write_payload(&self, payload: &mut Vec<u8>) -> Result<(), CodecError> {
         let count = self.len();
-        let mut payload = Vec::with_capacity(64 + count * (size_of::<Keypoint>() + 131));
+        payload.reserve(64 + count * (size_of::<Keypoint>() + 131));
         payload.extend_from_slice(&self.width.to_le_bytes());
         payload.extend_from_slice(&self.height.to_le_bytes());
         payload.extend_from_slice(&(count as u64).to_le_bytes());
@@ -33,7 +33,7 @@ impl Artifact for ImageFeatures {
         }
         payload.extend_from_slice(bytemuck::cast_slice(&self.colors));
         payload.extend_from_slice(&self.descriptors);
-        Ok(payload)
+        Ok(())
     }
 
     fn from_payload(payload: &[u8]) -> Result<Self, CodecError> {
@@ -83,8 +83,9 @@ impl Artifact for PairMatches {
     const KIND: &'static str = "matches";
     const SCHEMA: u32 = 1;
 
-    fn to_payload(&self) -> Result<Vec<u8>, CodecError> {
-        Ok(self.0.iter().flat_map(|m| [m.first.to_le_bytes(), m.second.to_le_bytes()]).flatten().collect())
+    fn write_payload(&self, payload: &mut Vec<u8>) -> Result<(), CodecError> {
+        payload.extend(self.0.iter().flat_map(|m| [m.first.to_le_bytes(), m.second.to_le_bytes()]).flatten());
+        Ok(())
     }
 
     fn from_payload(payload: &[u8]) -> Result<Self, CodecError> {

@@ -11,8 +11,8 @@ use crate::config::Config;
 use crate::dataset::{ImageFolder, SkippedImage};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
-use crate::graph::{JobGraph, RunResult};
-use crate::jobs::add_scene;
+use crate::graph::{Executor, JobGraph, RunResult};
+use crate::jobs::{SceneJobs, add_scene};
 use crate::scene::SceneFile;
 use crate::session::Session;
 
@@ -21,7 +21,7 @@ pub struct Built {
     /// The scene.
     pub scene: Arc<SceneFile>,
     /// The bytes of its file.
-    pub file: Vec<u8>,
+    pub file: Arc<Vec<u8>>,
     /// Its content hash.
     pub hash: ContentHash,
     /// Images that are not in it, and why.
@@ -42,8 +42,10 @@ pub enum BuildOutcome {
 
 /// Builds a scene; with the hash that the output already has, an unchanged scene is not read.
 ///
+/// `export` gets the scene while its last results are still being kept.
+///
 /// # Errors
-/// When no image is usable, the run was stopped or the store cannot be written.
+/// When no image is usable, the run was stopped or the store cannot be written; or as `export` does.
 pub fn build_scene(
     session: &Session,
     folder: &ImageFolder,
@@ -51,41 +53,61 @@ pub fn build_scene(
     seed: u64,
     name: &str,
     present: Option<ContentHash>,
+    export: impl FnOnce(&Built) -> Result<()>,
 ) -> Result<BuildOutcome> {
     let mut graph = JobGraph::default();
     let jobs = add_scene(&mut graph, &folder.images, config, seed)?;
     graph.want(jobs.scene);
+    graph.want_file(jobs.scene);
     jobs.features.iter().for_each(|features| graph.want(*features));
-    session.run(name, &graph, |executor, run| {
-        session.remember(name, run)?;
-        let mut skipped = folder.skipped.clone();
-        for (image, job) in folder.images.iter().zip(&jobs.features) {
-            if let Some(reason) = run.failed.get(&graph.job(*job).label()) {
-                skipped.push(SkippedImage { name: image.name.clone(), reason: reason.clone() });
-            }
+    let use_results = |executor: &Executor<'_>, run: &RunResult| {
+        let outcome = outcome_of(executor, &graph, &jobs, folder, run, present)?;
+        if let BuildOutcome::Built(built) = &outcome {
+            export(built)?;
         }
-        if skipped.len() == folder.skipped.len() + folder.images.len() {
-            let reasons: Vec<String> = skipped.iter().map(|s| format!("{}: {}", s.name, s.reason)).collect();
-            let message = format!("no usable image: {}", reasons.join("; "));
-            return Err(Hinted::error(message, "check the files with an image viewer"));
+        Ok(outcome)
+    };
+    let (run, outcome) = session.run_with(name, &graph, use_results)?;
+    session.remember(name, &run)?;
+    outcome
+}
+
+/// What the jobs came to; the scene is read unless it is `present`.
+fn outcome_of(
+    executor: &Executor<'_>,
+    graph: &JobGraph<'_>,
+    jobs: &SceneJobs,
+    folder: &ImageFolder,
+    run: &RunResult,
+    present: Option<ContentHash>,
+) -> Result<BuildOutcome> {
+    let mut skipped = folder.skipped.clone();
+    for (image, job) in folder.images.iter().zip(&jobs.features) {
+        if let Some(reason) = run.failed.get(&graph.job(*job).label()) {
+            skipped.push(SkippedImage { name: image.name.clone(), reason: reason.clone() });
         }
-        let Some(hash) = executor.output(jobs.scene) else {
-            let reasons: Vec<String> =
-                run.failed.iter().map(|(job, reason)| format!("{job}: {reason}")).collect();
-            anyhow::bail!("the scene could not be made: {}", reasons.join("; "));
-        };
-        if present == Some(hash) {
-            return Ok(BuildOutcome::Unchanged(run.clone(), skipped));
-        }
-        let load_features = || {
-            let made = folder.images.par_iter().with_max_len(1).zip(&jobs.features);
-            let made = made.filter(|(_, job)| executor.output(**job).is_some());
-            made.map(|(image, job)| Ok((image.name.clone(), executor.load::<ImageFeatures>(*job)?))).collect()
-        };
-        let load_scene =
-            || Ok((executor.load::<SceneFile>(jobs.scene)?, executor.file::<SceneFile>(jobs.scene)?));
-        let (scene, features): (Result<_>, Result<BTreeMap<_, _>>) = rayon::join(load_scene, load_features);
-        let ((scene, file), features) = (scene?, features?);
-        Ok(BuildOutcome::Built(Box::new(Built { scene, file, hash, skipped, features, run: run.clone() })))
-    })
+    }
+    if skipped.len() == folder.skipped.len() + folder.images.len() {
+        let reasons: Vec<String> = skipped.iter().map(|s| format!("{}: {}", s.name, s.reason)).collect();
+        let message = format!("no usable image: {}", reasons.join("; "));
+        return Err(Hinted::error(message, "check the files with an image viewer"));
+    }
+    let Some(hash) = executor.output(jobs.scene) else {
+        let reasons: Vec<String> =
+            run.failed.iter().map(|(job, reason)| format!("{job}: {reason}")).collect();
+        anyhow::bail!("the scene could not be made: {}", reasons.join("; "));
+    };
+    if present == Some(hash) {
+        return Ok(BuildOutcome::Unchanged(run.clone(), skipped));
+    }
+    let load_features = || {
+        let made = folder.images.par_iter().with_max_len(1).zip(&jobs.features);
+        let made = made.filter(|(_, job)| executor.output(**job).is_some());
+        made.map(|(image, job)| Ok((image.name.clone(), executor.load::<ImageFeatures>(*job)?))).collect()
+    };
+    let load_scene =
+        || Ok((executor.load::<SceneFile>(jobs.scene)?, executor.file::<SceneFile>(jobs.scene)?));
+    let (scene, features): (Result<_>, Result<BTreeMap<_, _>>) = rayon::join(load_scene, load_features);
+    let ((scene, file), features) = (scene?, features?);
+    Ok(BuildOutcome::Built(Box::new(Built { scene, file, hash, skipped, features, run: run.clone() })))
 }

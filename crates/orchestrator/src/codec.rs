@@ -15,11 +15,11 @@ pub trait Artifact: Send + Sync + Sized + 'static {
     /// Version of the layout; one more for each incompatible change.
     const SCHEMA: u32;
 
-    /// The payload.
+    /// Appends the payload.
     ///
     /// # Errors
     /// [`CodecError::Encode`] when a value cannot be written.
-    fn to_payload(&self) -> Result<Vec<u8>, CodecError>;
+    fn write_payload(&self, file: &mut Vec<u8>) -> Result<(), CodecError>;
 
     /// The value of a payload.
     ///
@@ -36,8 +36,8 @@ macro_rules! serde_artifact {
             const KIND: &'static str = $kind;
             const SCHEMA: u32 = $schema;
 
-            fn to_payload(&self) -> Result<Vec<u8>, $crate::codec::CodecError> {
-                $crate::codec::to_bytes(self)
+            fn write_payload(&self, file: &mut Vec<u8>) -> Result<(), $crate::codec::CodecError> {
+                $crate::codec::write_bytes(self, file)
             }
 
             fn from_payload(payload: &[u8]) -> Result<Self, $crate::codec::CodecError> {
@@ -83,12 +83,23 @@ pub enum CodecError {
     Payload(String),
 }
 
-/// Serde value to bytes.
+/// Appends to what is there.
+struct Appended<'v>(&'v mut Vec<u8>);
+
+impl bincode::enc::write::Writer for Appended<'_> {
+    #[inline]
+    fn write(&mut self, bytes: &[u8]) -> Result<(), bincode::error::EncodeError> {
+        self.0.extend_from_slice(bytes);
+        Ok(())
+    }
+}
+
+/// Appends a serde value.
 ///
 /// # Errors
 /// [`CodecError::Encode`] when a value cannot be written.
-pub fn to_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
-    bincode::serde::encode_to_vec(value, bincode::config::standard())
+pub fn write_bytes<T: Serialize>(value: &T, to: &mut Vec<u8>) -> Result<(), CodecError> {
+    bincode::serde::encode_into_writer(value, Appended(to), bincode::config::standard())
         .map_err(|e| CodecError::Encode(e.to_string()))
 }
 
@@ -111,15 +122,20 @@ pub fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
 /// # Errors
 /// [`CodecError::Encode`] when a value cannot be written.
 pub fn encode<T: Artifact>(value: &T) -> Result<Vec<u8>, CodecError> {
-    let payload = value.to_payload()?;
-    let mut file = Vec::with_capacity(payload.len() + 64 + T::KIND.len());
+    let mut file = Vec::new();
     file.extend_from_slice(MAGIC);
     file.extend_from_slice(&T::SCHEMA.to_le_bytes());
     file.extend_from_slice(&(T::KIND.len() as u16).to_le_bytes());
     file.extend_from_slice(T::KIND.as_bytes());
-    file.extend_from_slice(&(payload.len() as u64).to_le_bytes());
-    file.extend_from_slice(blake3::hash(&payload).as_bytes());
-    file.extend_from_slice(&payload);
+    // What these say is known once the payload is there; it is not written elsewhere first, tens of megabytes as it is.
+    let length_at = file.len();
+    file.extend_from_slice(&[0; 8 + 32]);
+    let (checksum_at, payload_at) = (length_at + 8, file.len());
+    value.write_payload(&mut file)?;
+    let length = (file.len() - payload_at) as u64;
+    let checksum = blake3::hash(&file[payload_at..]);
+    file[length_at..checksum_at].copy_from_slice(&length.to_le_bytes());
+    file[checksum_at..payload_at].copy_from_slice(checksum.as_bytes());
     Ok(file)
 }
 

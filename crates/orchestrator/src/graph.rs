@@ -2,6 +2,7 @@
 
 mod events;
 mod executor;
+mod gathering;
 mod job;
 mod plan;
 

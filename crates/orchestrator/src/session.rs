@@ -46,7 +46,7 @@ impl Session {
         Ok(Self { store, report, observer: Broadcast::new(observers), limits, stop })
     }
 
-    /// Runs a graph and hands the results to `use_results`.
+    /// Runs a graph and hands the results to `use_results` once they are kept.
     ///
     /// Of a run that does not come to its end, the results made so far are noted under `name`, so that garbage
     /// collection leaves them for the next attempt.
@@ -59,22 +59,45 @@ impl Session {
         graph: &JobGraph<'_>,
         use_results: impl FnOnce(&Executor<'_>, &RunResult) -> Result<R>,
     ) -> Result<R> {
-        let options = RunOptions {
+        let options = self.options();
+        let executor = Executor::new(graph, &options);
+        let run = self.noting_unfinished(name, &executor, executor.run())?;
+        use_results(&executor, &run)
+    }
+
+    /// Runs a graph; `meanwhile` gets the results while the last of them are still being kept, as
+    /// [`Executor::run_with`].
+    ///
+    /// # Errors
+    /// When stopped or when the store cannot be written; what was done is then noted as by [`Session::run`].
+    pub fn run_with<R>(
+        &self,
+        name: &str,
+        graph: &JobGraph<'_>,
+        meanwhile: impl FnOnce(&Executor<'_>, &RunResult) -> R,
+    ) -> Result<(RunResult, R)> {
+        let options = self.options();
+        let executor = Executor::new(graph, &options);
+        let run = executor.run_with(|run| meanwhile(&executor, run));
+        self.noting_unfinished(name, &executor, run)
+    }
+
+    fn options(&self) -> RunOptions<'_> {
+        RunOptions {
             store: &self.store,
             observer: &self.observer,
             threads: self.limits.threads,
             memory: self.limits.memory,
             stop: &self.stop,
-        };
-        let executor = Executor::new(graph, &options);
-        match executor.run() {
-            Ok(result) => use_results(&executor, &result),
-            Err(error) => {
-                // On a full disk this fails as well; what the caller has to hear is why the run ended.
-                let _ = self.store.note_unfinished(name, executor.result().keys);
-                Err(error)
-            }
         }
+    }
+
+    fn noting_unfinished<T>(&self, name: &str, executor: &Executor<'_>, run: Result<T>) -> Result<T> {
+        if run.is_err() {
+            // On a full disk this fails as well; what the caller has to hear is why the run ended.
+            let _ = self.store.note_unfinished(name, executor.result().keys);
+        }
+        run
     }
 
     /// Remembers a run under a name, for `plan`, `explain` and `status`.

@@ -482,11 +482,21 @@ pub fn create_folder(path: &Path) -> Result<()> {
 /// # Errors
 /// When the disk is full or not writable; nothing is left behind then.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
+    write_pieces_atomically(path, [bytes])
+}
+
+/// The same for a file in pieces, none of them small.
+///
+/// # Errors
+/// As [`write_atomically`].
+pub fn write_pieces_atomically<'p>(path: &Path, pieces: impl IntoIterator<Item = &'p [u8]>) -> Result<()> {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     create_folder(folder)?;
-    let write = || -> std::io::Result<()> {
+    let write = move || -> std::io::Result<()> {
         let mut file = tempfile::Builder::new().prefix(TEMPORARY).tempfile_in(folder)?;
-        file.write_all(bytes)?;
+        for piece in pieces {
+            file.write_all(piece)?;
+        }
         file.as_file().sync_all()?;
         set_usual_permissions(file.as_file())?;
         file.persist(path).map_err(|e| e.error)?;

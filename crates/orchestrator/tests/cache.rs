@@ -23,7 +23,7 @@ fn build(store: &Path, panoramas: &Path, config: &Config) -> Box<Built> {
     let session = Session::open(store, None, limits, Arc::new(AtomicBool::new(false))).unwrap();
     let files = list_images(&[panoramas.to_owned()]).unwrap();
     let folder = ImageFolder::read(&files, &CameraBook::default(), &GeoSource::None, None).unwrap();
-    match build_scene(&session, &folder, config, 7, "test", None).unwrap() {
+    match build_scene(&session, &folder, config, 7, "test", None, |_| Ok(())).unwrap() {
         BuildOutcome::Built(built) => built,
         BuildOutcome::Unchanged(..) => panic!("no present hash was given"),
     }
@@ -69,7 +69,8 @@ fn build_and_locate(folder: &Path, config: &Config) -> Vec<String> {
         let files = list_images(&[town.join(part)]).unwrap();
         ImageFolder::read(&files, &cameras, &GeoSource::None, None).unwrap()
     };
-    let built = match build_scene(&session, &read("panoramas"), config, 7, "scene", None).unwrap() {
+    let built = match build_scene(&session, &read("panoramas"), config, 7, "scene", None, |_| Ok(())).unwrap()
+    {
         BuildOutcome::Built(built) => built,
         BuildOutcome::Unchanged(..) => panic!("no present hash was given"),
     };

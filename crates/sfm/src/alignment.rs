@@ -341,7 +341,7 @@ impl<'a> Tracks<'a> {
         }
         let found = in_each(registered, load, |image, pyramid| self.align(image, pyramid, &templates))?;
         let mut aligned: Vec<Vec<Option<Aligned>>> =
-            self.component.points.iter().map(|point| vec![None; point.track.len()]).collect();
+            self.component.points.par_iter().map(|point| vec![None; point.track.len()]).collect();
         for (point, at, place) in found.into_iter().flatten() {
             aligned[point][at] = Some(place);
         }
@@ -479,17 +479,18 @@ impl<'a> Tracks<'a> {
         }
         let points = component.points.iter();
         problem.points = points.map(|point| BundlePoint { position: point.position, fixed: false }).collect();
-        let observation = |point: usize, at: usize| {
-            let seen = component.points[point].track[at];
-            let pose = pose_of_image[seen.image.index()]?;
+        let mut sightings: Vec<(u32, usize, usize)> = Vec::with_capacity(component.observation_count());
+        for (point, seen) in component.points.iter().enumerate() {
+            let pose =
+                |(at, seen): (usize, &Observation)| Some((pose_of_image[seen.image.index()]?, point, at));
+            sightings.extend(seen.track.iter().enumerate().filter_map(pose));
+        }
+        let observation = |&(pose, point, at): &(u32, usize, usize)| {
             let Place { pixel, noise_px } =
                 self.place(point, at, aligned[point][at].as_ref(), middles[point].as_ref());
-            Some(BundleObservation { pose, point: point as u32, pixel, noise_px })
+            BundleObservation { pose, point: point as u32, pixel, noise_px }
         };
-        let points = component.points.par_iter().enumerate();
-        problem.observations = points
-            .flat_map_iter(|(point, seen)| (0..seen.track.len()).filter_map(move |at| observation(point, at)))
-            .collect();
+        problem.observations = sightings.par_iter().map(observation).collect();
         problem.observations.extend(further.iter().filter_map(|found| {
             let &Further { point, image, place: Place { pixel, noise_px } } = found;
             let pose = pose_of_image[image.index()]?;

@@ -147,7 +147,7 @@ pub fn solve(params: &BundleParams, problem: &mut BundleProblem) -> BundleReport
     let unknowns = equations.unknowns();
     let degrees_of_freedom = (2 * observations + 3 * priors) as i64 - unknowns as i64;
     let outcome = if unknowns == 0 {
-        Outcome::nothing_to_do(equations.linearize(&model))
+        Outcome::nothing_to_do(equations.linearize(&model, 0.0))
     } else {
         minimize(&mut model, &mut equations, &Limits::from(params))
     };
@@ -186,7 +186,7 @@ pub fn covariance(problem: &BundleProblem, loss: RobustLoss, poses: &[u32]) -> O
         return Some(vec![Matrix6::zeros(); poses.len()]);
     }
     let mut equations = NormalEquations::<POSE_DIM>::new(layout.structure, &Budget::MEMORY);
-    let cost = equations.linearize(&model);
+    let cost = equations.linearize(&model, 0.0);
     if !cost.is_finite() || !equations.is_definite_by(SINGULAR_SHARE) || !equations.factorize(0.0) {
         return None;
     }

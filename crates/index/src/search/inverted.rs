@@ -18,6 +18,7 @@ const ROUNDS: usize = 8;
 /// M. Douze, C. Schmid, "Product quantization for nearest neighbor search", PAMI 2011, section IV: inverted lists.)
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub(crate) struct InvertedLists {
+    #[serde(with = "crate::bytes")]
     centroids: Vec<u8>,
     /// List `l` holds the rows `starts[l] .. starts[l + 1]` of the reordered descriptors.
     starts: Vec<u32>,
@@ -45,7 +46,7 @@ impl InvertedLists {
         }
         let assigned = nearest_lists(descriptors, &centroids);
         let mut order: Vec<u32> = (0..rows as u32).collect();
-        order.sort_by_key(|&row| assigned[row as usize]);
+        order.par_sort_by_key(|&row| assigned[row as usize]);
         let mut starts = vec![0_u32; centroids.len() / DESCRIPTOR_LEN + 1];
         for &list in &assigned {
             starts[list + 1] += 1;

@@ -142,6 +142,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         options.seed,
         &run_name(&root.join(kind)),
         None,
+        |_| Ok(()),
     )? {
         BuildOutcome::Built(built) => *built,
         BuildOutcome::Unchanged(..) => anyhow::bail!("the scene was not read: this is a bug"),

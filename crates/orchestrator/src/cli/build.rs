@@ -38,16 +38,19 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     let present = std::fs::read(output).ok().map(|bytes| ContentHash::of(&bytes));
     // The report is written last: exports of another scene, as a killed run leaves them, are none of this one.
     let present = present.filter(|hash| reported_scene(&export) == Some(*hash));
-    let outcome = build_scene(&session, &folder, &config, args.source.run.seed, &name, present)?;
+    let write = |built: &Built| {
+        let (scene, models) =
+            rayon::join(|| write_atomically(output, &built.file), || write_models(&export, built));
+        scene.and(models)
+    };
+    let seed = args.source.run.seed;
+    let outcome = build_scene(&session, &folder, &config, seed, &name, present, write)?;
     let (run, skipped) = match &outcome {
         BuildOutcome::Unchanged(run, skipped) => {
             print::note(&format!("{} is up to date: nothing changed", output.display()));
             (run, skipped)
         }
         BuildOutcome::Built(built) => {
-            let (scene, models) =
-                rayon::join(|| write_atomically(output, &built.file), || write_models(&export, built));
-            scene.and(models)?;
             write_report(&export, built, &session)?;
             summarize(&built.scene, folder.images.len() + folder.skipped.len());
             (&built.run, &built.skipped)

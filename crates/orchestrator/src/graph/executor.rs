@@ -3,13 +3,13 @@
 use std::any::Any;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 
 use super::events::{Event, Observer};
+use super::gathering::{Gathering, Limits};
 use super::job::{Inputs, JobGraph, JobId, Product};
 use crate::clock;
 use crate::codec::{self, Artifact};
@@ -77,6 +77,8 @@ struct Slot {
     key: Option<ContentHash>,
     output: Option<ContentHash>,
     value: Option<Arc<dyn Any + Send + Sync>>,
+    /// The result's file, where it was made and the caller will ask for it.
+    file: Option<Arc<Vec<u8>>>,
     /// Users that have not finished; the value is dropped from memory after the last.
     users_left: usize,
     dependencies_left: usize,
@@ -90,25 +92,20 @@ struct Shared {
     fatal: Option<anyhow::Error>,
 }
 
-/// Results that may wait to be kept; further ones hold up the jobs that made them.
-const MOST_WAITING: usize = 16;
-
 /// Threads that keep results. They wait for the disk most of the time, and file systems sync several files at once for
 /// the price of one.
 const KEEPERS: usize = 4;
 
-/// How long a small result waits for others that are kept with it: what a kill may cost, against a file for each.
-const GATHERING: Duration = Duration::from_millis(100);
-
-/// Bytes of results that wait for no others.
-const ENOUGH_BYTES: usize = 1 << 18;
+/// What may wait to be kept: what a kill may cost, against a file of records for each result.
+const KEEPING: Limits =
+    Limits { time: Duration::from_millis(250), enough_bytes: 4 << 20, most_bytes: 32 << 20 };
 
 /// The result of a job on its way to the store.
 struct Unkept {
     id: JobId,
     fingerprint: Fingerprint,
     output: ContentHash,
-    file: Vec<u8>,
+    file: Arc<Vec<u8>>,
     started_secs: f64,
     wall_secs: f64,
     cpu_secs: f64,
@@ -119,20 +116,6 @@ impl Unkept {
         let Self { fingerprint, output, file, cpu_secs, .. } = self;
         Output { fingerprint, hash: *output, file, cpu_secs: *cpu_secs }
     }
-}
-
-/// The next results to be kept at once: small ones that come soon after each other; none when no more will come.
-fn next_together(unkept: &Receiver<Unkept>) -> Vec<Unkept> {
-    let Ok(first) = unkept.recv() else { return Vec::new() };
-    let until = Instant::now() + GATHERING;
-    let (mut bytes, mut together) = (first.file.len(), vec![first]);
-    while bytes < ENOUGH_BYTES
-        && let Ok(next) = unkept.recv_timeout(until.saturating_duration_since(Instant::now()))
-    {
-        bytes += next.file.len();
-        together.push(next);
-    }
-    together
 }
 
 /// A graph being run.
@@ -157,6 +140,7 @@ impl<'a> Executor<'a> {
                 key: None,
                 output: None,
                 value: None,
+                file: None,
                 users_left: graph.user_count(id),
                 dependencies_left: graph.uses(id).count(),
             })
@@ -179,29 +163,38 @@ impl<'a> Executor<'a> {
     /// # Errors
     /// When stopped, or when the store cannot be written. A failing job is no error: see [`RunResult::failed`].
     pub fn run(&self) -> Result<RunResult> {
+        self.run_with(|_| ()).map(|(result, ())| result)
+    }
+
+    /// Runs all jobs; `meanwhile` gets the results while the last of them are still being kept.
+    ///
+    /// What it loads must be in memory or have been stored before: see [`JobGraph::want`].
+    ///
+    /// # Errors
+    /// As [`Executor::run`]. `meanwhile` may have been called when what it was given could not be kept.
+    pub fn run_with<R>(&self, meanwhile: impl FnOnce(&RunResult) -> R) -> Result<(RunResult, R)> {
         let mut jobs = BTreeMap::new();
         for id in self.graph.graph.node_indices() {
             *jobs.entry(self.graph.job(id).kind.to_owned()).or_insert(0) += 1;
         }
         self.options.observer.notice(&Event::Planned { jobs });
         // Syncing a file to the disk takes as long as many a job does, and no core: it is done beside the jobs.
-        let (keep, unkept) = sync_channel(MOST_WAITING);
-        let unkept = Mutex::new(unkept);
-        std::thread::scope(|threads| {
+        let unkept = Gathering::new(KEEPING);
+        let used = std::thread::scope(|threads| {
+            let open = unkept.open();
             for _ in 0..KEEPERS {
                 threads.spawn(|| self.keep_results(&unkept));
             }
-            rayon::scope(|scope| self.pump(scope, &keep));
-            drop(keep);
+            rayon::scope(|scope| self.pump(scope, &unkept));
+            drop(open);
+            let ended_early = self.lock().fatal.is_some() || self.options.stop.load(Ordering::Relaxed);
+            (!ended_early).then(|| meanwhile(&self.result()))
         });
         self.options.observer.notice(&Event::Ended);
         if let Some(error) = self.lock().fatal.take() {
             return Err(error);
         }
-        if self.options.stop.load(Ordering::Relaxed) {
-            return Err(Interrupted.into());
-        }
-        Ok(self.result())
+        used.map(|used| (self.result(), used)).ok_or_else(|| Interrupted.into())
     }
 
     /// What the jobs came to so far.
@@ -225,7 +218,7 @@ impl<'a> Executor<'a> {
     }
 
     /// Starts as many ready jobs as threads and memory allow, in the order they were added.
-    fn pump<'s>(&'s self, scope: &rayon::Scope<'s>, keep: &'s SyncSender<Unkept>) {
+    fn pump<'s>(&'s self, scope: &rayon::Scope<'s>, unkept: &'s Gathering<Unkept>) {
         loop {
             let mut shared = self.lock();
             let stopped = self.options.stop.load(Ordering::Relaxed) || shared.fatal.is_some();
@@ -242,21 +235,21 @@ impl<'a> Executor<'a> {
             shared.memory_in_flight += self.graph.job(id).memory;
             drop(shared);
             scope.spawn(move |scope| {
-                self.settle(id, keep);
-                self.pump(scope, keep);
+                self.settle(id, unkept);
+                self.pump(scope, unkept);
             });
         }
     }
 
     /// Decides one job and frees those that waited for it.
-    fn settle(&self, id: JobId, keep: &SyncSender<Unkept>) {
+    fn settle(&self, id: JobId, unkept: &Gathering<Unkept>) {
         let job = self.graph.job(id);
         let lacking = self.graph.uses(id).any(|(used, edge)| edge.required && self.output(used).is_none());
         let (state, key, output) = if lacking {
             self.options.observer.notice(&Event::Skipped { kind: job.kind, job: job.name.clone() });
             (State::Skipped, None, None)
         } else {
-            self.decide(id, keep)
+            self.decide(id, unkept)
         };
         let mut shared = self.lock();
         shared.in_flight -= 1;
@@ -286,7 +279,7 @@ impl<'a> Executor<'a> {
     fn decide(
         &self,
         id: JobId,
-        keep: &SyncSender<Unkept>,
+        unkept: &Gathering<Unkept>,
     ) -> (State, Option<ContentHash>, Option<ContentHash>) {
         let job = self.graph.job(id);
         let fingerprint = self.fingerprint(id);
@@ -297,9 +290,8 @@ impl<'a> Executor<'a> {
         }
         match self.execute(id, fingerprint) {
             Ok(made) => {
-                let output = made.output;
-                // The receiver lives as long as any job runs.
-                let _ = keep.send(made);
+                let (output, bytes) = (made.output, made.file.len());
+                unkept.add(made, bytes);
                 (State::Ran, Some(key), Some(output))
             }
             Err(error) => (self.failed(id, &error), Some(key), None),
@@ -315,9 +307,9 @@ impl<'a> Executor<'a> {
     }
 
     /// Stores results until no job is left that could send one.
-    fn keep_results(&self, unkept: &Mutex<Receiver<Unkept>>) {
+    fn keep_results(&self, unkept: &Gathering<Unkept>) {
         loop {
-            let together = next_together(&unkept.lock().unwrap_or_else(PoisonError::into_inner));
+            let together = unkept.next();
             if together.is_empty() {
                 return;
             }
@@ -380,10 +372,13 @@ impl<'a> Executor<'a> {
         let wall_secs = wall.elapsed().as_secs_f64();
         self.running.fetch_sub(1, Ordering::SeqCst);
         let Product { value, file } = product?;
-        let output = ContentHash::of(&file);
+        let (output, file) = (ContentHash::of(&file), Arc::new(file));
         let slot = &mut self.lock().slots[id.index()];
         if slot.users_left > 0 {
             slot.value = Some(value);
+        }
+        if self.graph.wants_file(id) {
+            slot.file = Some(Arc::clone(&file));
         }
         Ok(Unkept { id, fingerprint, output, file, started_secs, wall_secs, cpu_secs })
     }
@@ -424,13 +419,16 @@ impl<'a> Executor<'a> {
     ///
     /// # Errors
     /// As [`Executor::load`].
-    pub fn file<T: Artifact>(&self, id: JobId) -> Result<Vec<u8>> {
-        let (key, output) = {
+    pub fn file<T: Artifact>(&self, id: JobId) -> Result<Arc<Vec<u8>>> {
+        let (file, key, output) = {
             let slot = &self.lock().slots[id.index()];
-            (slot.key, slot.output)
+            (slot.file.clone(), slot.key, slot.output)
         };
+        if let Some(file) = file {
+            return Ok(file);
+        }
         let stored = key.zip(output).and_then(|(key, output)| self.options.store.read(key, output).ok());
-        stored.map_or_else(|| Ok(codec::encode(&*self.load::<T>(id)?)?), Ok)
+        stored.map_or_else(|| Ok(codec::encode(&*self.load::<T>(id)?)?), Ok).map(Arc::new)
     }
 
     fn keep(&self, id: JobId, value: Arc<dyn Any + Send + Sync>) -> Arc<dyn Any + Send + Sync> {

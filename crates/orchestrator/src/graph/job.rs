@@ -75,6 +75,7 @@ pub(super) struct Use {
 pub struct JobGraph<'a> {
     pub(super) graph: DiGraph<Job<'a>, Use>,
     wanted: BTreeSet<JobId>,
+    wanted_files: BTreeSet<JobId>,
 }
 
 impl<'a> JobGraph<'a> {
@@ -86,6 +87,11 @@ impl<'a> JobGraph<'a> {
     /// Says that the caller will load the result of a job: it stays in memory once it is there.
     pub fn want(&mut self, job: JobId) {
         self.wanted.insert(job);
+    }
+
+    /// Says that the caller will ask for the file of a job's result: it stays in memory once it is there.
+    pub fn want_file(&mut self, job: JobId) {
+        self.wanted_files.insert(job);
     }
 
     /// Lets `user` use the result of `used`; without it, `user` is left out.
@@ -134,6 +140,10 @@ impl<'a> JobGraph<'a> {
     /// How many will load a job's result.
     pub(super) fn user_count(&self, id: JobId) -> usize {
         self.users(id).count() + usize::from(self.wanted.contains(&id))
+    }
+
+    pub(super) fn wants_file(&self, id: JobId) -> bool {
+        self.wanted_files.contains(&id)
     }
 
     pub(super) fn users(&self, id: JobId) -> impl Iterator<Item = JobId> {

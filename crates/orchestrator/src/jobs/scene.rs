@@ -76,9 +76,13 @@ pub fn add_scene(
     let scene_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
         let index = inputs.get::<SceneIndex>("index")?;
+        let (components, copy) = rayon::join(
+            || output.components.iter().map(|model| named(model, &names)).collect(),
+            || (*index).clone(),
+        );
         Product::new(SceneFile {
-            components: output.components.iter().map(|model| named(model, &names)).collect(),
-            index: (*index).clone(),
+            components,
+            index: copy,
             origin: output.report.georegistration.as_ref().and(origin),
             warnings: (output.report.warnings.iter().map(|text| with_names(text, &names)))
                 .chain(index.recall().filter(|recall| *recall < MIN_RECALL).map(poor_recall))

@@ -86,24 +86,22 @@ pub(super) fn minimize<const D: usize, M: Model<D>>(
     equations: &mut NormalEquations<D>,
     limits: &Limits,
 ) -> Outcome {
-    let mut cost = equations.linearize(model);
+    let (mut lambda, mut growth) = (INITIAL_LAMBDA, 2.0);
+    let mut cost = equations.linearize(model, lambda);
     let mut outcome = Outcome::new(cost, Termination::IterationLimit);
     if !cost.is_finite() {
         outcome.termination = Termination::NotFinite;
         return outcome;
     }
-    let (mut lambda, mut growth) = (INITIAL_LAMBDA, 2.0);
     while outcome.iterations < limits.max_iterations {
         outcome.iterations += 1;
-        let sums = if equations.factorize(lambda) { equations.solve(lambda) } else { None };
-        if let Some(sums) = sums {
+        let step = if equations.factorize(lambda) { equations.solve(lambda, model) } else { None };
+        if let Some((sums, candidate)) = step {
             // Below this neither the costs' difference nor the decision by it means anything.
             if sums.predicted <= f64::EPSILON * cost {
                 outcome.termination = Termination::Converged;
                 break;
             }
-            let candidate =
-                if model.propose(equations.step()) { equations.candidate_cost(model) } else { f64::INFINITY };
             let small = limits.parameter_tolerance * (sums.squared_norm + model.squared_norm()).sqrt();
             let is_small_step = sums.squared_step.sqrt() <= small;
             if candidate < cost {
@@ -120,7 +118,7 @@ pub(super) fn minimize<const D: usize, M: Model<D>>(
                     break;
                 }
                 if outcome.iterations < limits.max_iterations {
-                    equations.linearize(model);
+                    equations.linearize(model, lambda);
                 }
                 continue;
             }

@@ -129,6 +129,8 @@ pub(super) struct NormalEquations<const D: usize> {
     schur: Vec<f64>,
     step: Vec<f64>,
     damping: Vec<f64>,
+    /// λ for which the points are eliminated.
+    eliminated_for: Option<f64>,
     system: ReducedSystem,
 }
 
@@ -269,6 +271,7 @@ impl<const D: usize> NormalEquations<D> {
             damping: vec![0.0; pattern.size()],
             pattern,
             chunks,
+            eliminated_for: None,
             system,
         }
     }
@@ -296,8 +299,11 @@ impl<const D: usize> NormalEquations<D> {
         }
     }
 
-    /// Builds H and g at the current state; returns the cost.
-    pub fn linearize<M: Model<D>>(&mut self, model: &M) -> f64 {
+    /// Builds H and g at the current state and eliminates the points for damping λ; returns the cost.
+    ///
+    /// [`NormalEquations::factorize`] does the latter for any λ, but waking other threads takes as long as many points
+    /// do: small problems are handed out as few times as possible.
+    pub fn linearize<M: Model<D>>(&mut self, model: &M, lambda: f64) -> f64 {
         let Self {
             links, targets, observation_starts, points, couplings, block_count, pattern, chunks, ..
         } = self;
@@ -396,7 +402,9 @@ impl<const D: usize> NormalEquations<D> {
                 chunk.point_gradient[point - chunk.points.start] = g;
             }
             chunk.cost = 0.5 * losses.total();
+            chunk.eliminate::<D>(lambda, couplings, pattern);
         });
+        self.eliminated_for = Some(lambda);
         let mut cost = 0.0;
         self.base.fill(0.0);
         self.gradient.fill(0.0);
@@ -422,8 +430,11 @@ impl<const D: usize> NormalEquations<D> {
                 self.damping[start + k] = lambda * bounded(self.base[offset + k * (dim + 1)]);
             }
         }
-        let Self { couplings, pattern, chunks, .. } = self;
-        for_each_chunk(chunks, |chunk| chunk.eliminate::<D>(lambda, couplings, pattern));
+        if self.eliminated_for != Some(lambda) {
+            let Self { couplings, pattern, chunks, .. } = self;
+            for_each_chunk(chunks, |chunk| chunk.eliminate::<D>(lambda, couplings, pattern));
+            self.eliminated_for = Some(lambda);
+        }
         if !self.chunks.iter().all(|chunk| chunk.usable) {
             return false;
         }
@@ -461,10 +472,12 @@ impl<const D: usize> NormalEquations<D> {
         }
     }
 
-    /// The damped step after [`NormalEquations::factorize`] with the same λ; `None` when there is none.
+    /// The damped step after [`NormalEquations::factorize`] with the same λ, and what it leads to; `None` when there is
+    /// none.
     ///
-    /// The candidate points are set; the camera-side step is in [`NormalEquations::step`].
-    pub fn solve(&mut self, lambda: f64) -> Option<StepSums> {
+    /// The model's candidate and the candidate points are set; the cost of a candidate that is no valid state is
+    /// infinite.
+    pub fn solve<M: Model<D>>(&mut self, lambda: f64, model: &mut M) -> Option<(StepSums, f64)> {
         for (step, gradient) in self.step.iter_mut().zip(&self.gradient) {
             *step = -gradient;
         }
@@ -473,11 +486,25 @@ impl<const D: usize> NormalEquations<D> {
                 *step += reduced;
             }
         }
-        let Self { couplings, points, pattern, chunks, step, base, damping, system, .. } = self;
+        let Self {
+            observation_starts: starts,
+            couplings,
+            points,
+            pattern,
+            chunks,
+            step,
+            base,
+            damping,
+            eliminated_for,
+            system,
+            ..
+        } = self;
         if !step.is_empty() {
             match system {
                 ReducedSystem::Direct(system) => system.solve(step),
                 ReducedSystem::Iterative(system) => {
+                    // Products go where the elimination left the right-hand side.
+                    *eliminated_for = None;
                     let schur = ImplicitSchur { couplings, pattern, base, damping };
                     let multiply = |x: &[f64], to: &mut [f64]| schur.multiply::<D>(chunks, x, to);
                     if !system.solve(pattern, step, multiply) {
@@ -486,7 +513,20 @@ impl<const D: usize> NormalEquations<D> {
                 }
             }
         }
-        for_each_chunk(chunks, |chunk| chunk.substitute(lambda, step, points, couplings, pattern));
+        let is_valid = model.propose(step);
+        let (model, loss) = (&*model, model.loss());
+        for_each_chunk(chunks, |chunk| {
+            chunk.substitute(lambda, step, points, couplings, pattern);
+            let mut losses = LossSum::new(loss);
+            if is_valid {
+                for (point, position) in chunk.points.clone().zip(&chunk.candidate) {
+                    for observation in starts[point]..starts[point + 1] {
+                        losses.add(model.squared_residual(observation, position));
+                    }
+                }
+            }
+            chunk.cost = 0.5 * losses.total();
+        });
         // What the model decreases by also holds for conjugate gradients: what they leave is perpendicular to their step.
         let mut sums = StepSums::default();
         for ((step, gradient), damping) in self.step.iter().zip(&self.gradient).zip(&self.damping) {
@@ -498,22 +538,12 @@ impl<const D: usize> NormalEquations<D> {
             sums.squared_step += chunk.sums.squared_step;
             sums.squared_norm += chunk.sums.squared_norm;
         }
-        (sums.predicted.is_finite() && sums.squared_step.is_finite()).then_some(sums)
-    }
-
-    /// Cost of the candidate state.
-    pub fn candidate_cost<M: Model<D>>(&mut self, model: &M) -> f64 {
-        let (starts, loss) = (&self.observation_starts, model.loss());
-        for_each_chunk(&mut self.chunks, |chunk| {
-            let mut losses = LossSum::new(loss);
-            for (point, position) in chunk.points.clone().zip(&chunk.candidate) {
-                for observation in starts[point]..starts[point + 1] {
-                    losses.add(model.squared_residual(observation, position));
-                }
-            }
-            chunk.cost = 0.5 * losses.total();
-        });
-        self.chunks.iter().map(|chunk| chunk.cost).sum::<f64>() + model.block_terms_cost()
+        let cost = if is_valid {
+            self.chunks.iter().map(|chunk| chunk.cost).sum::<f64>() + model.block_terms_cost()
+        } else {
+            f64::INFINITY
+        };
+        (sums.predicted.is_finite() && sums.squared_step.is_finite()).then_some((sums, cost))
     }
 
     /// Makes the candidate points the current ones.
@@ -659,7 +689,7 @@ mod tests {
         let mut implicit =
             NormalEquations::<3>::new(structure(), &Budget::new(LinearSolver::Iterative, model.0.len()));
         for equations in [&mut direct, &mut implicit] {
-            equations.linearize(&model);
+            equations.linearize(&model, 1e-2);
             assert!(equations.factorize(1e-3));
         }
         assert!(implicit.schur.len() < direct.schur.len());

@@ -7,7 +7,7 @@ use setloc_features::{Camera, CameraModel, MAX_CAMERA_PARAMS};
 use super::normal_equations::{BlockTerm, Linearized, Link, Model, Structure};
 use super::pattern::NONE;
 use super::residual::{angular, angular_squared, bearing_change, point_row, rotation_row};
-use super::{BundleProblem, IntrinsicsFreedom, RobustLoss};
+use super::{BundleObservation, BundleProblem, IntrinsicsFreedom, RobustLoss};
 use crate::Rigid;
 
 /// Scalars of a pose: rotation (right perturbation, camera frame), then translation (world frame).
@@ -34,13 +34,22 @@ impl PoseState {
     }
 }
 
-/// One usable observation.
+/// One observation.
 #[derive(Debug, Clone, Copy)]
 struct Ray {
     pose: u32,
     /// Bearing and 1/σ while the intrinsics stay as they were at the start.
     bearing: Vector3<f64>,
     inverse_sigma: f64,
+}
+
+impl Ray {
+    /// Stands for an observation that cannot be used.
+    const UNUSABLE: Self = Self { pose: NONE, bearing: Vector3::new(0.0, 0.0, 0.0), inverse_sigma: 0.0 };
+
+    fn is_usable(&self) -> bool {
+        self.pose != NONE
+    }
 }
 
 /// Pixel and camera of an observation whose intrinsics are estimated.
@@ -107,7 +116,7 @@ impl Spherical {
                     && rotation.coords.iter().chain(translation.iter()).all(|value| value.is_finite())
             })
             .collect();
-        let usable_ray = |observation: &super::BundleObservation| {
+        let usable_ray = |observation: &BundleObservation| {
             if !*pose_usable.get(observation.pose as usize)? {
                 return None;
             }
@@ -120,19 +129,23 @@ impl Spherical {
                 bearing_and_weight(camera, &observation.pixel, observation.noise_px)?;
             Some(Ray { pose: observation.pose, bearing, inverse_sigma })
         };
-        let usable: Vec<(u32, Ray)> = problem
+        let given: Vec<Ray> = problem
             .observations
             .par_iter()
             .with_min_len(OBSERVATIONS_PER_TASK)
-            .enumerate()
-            .filter_map(|(index, observation)| Some((index as u32, usable_ray(observation)?)))
+            .map(|observation| usable_ray(observation).unwrap_or(Ray::UNUSABLE))
             .collect();
 
         // Counting sort by point; within a point the order given stays.
         let mut starts = vec![0_u32; problem.points.len() + 1];
-        for (index, _) in &usable {
-            starts[problem.observations[*index as usize].point as usize + 1] += 1;
+        let mut is_block = vec![false; problem.poses.len()];
+        for (observation, ray) in problem.observations.iter().zip(&given) {
+            if ray.is_usable() {
+                starts[observation.point as usize + 1] += 1;
+                is_block[observation.pose as usize] = true;
+            }
         }
+        let usable = starts.iter().map(|&count| count as usize).sum::<usize>();
         let mut points = Vec::new();
         let (mut free, mut point_of_index, mut compact) =
             (Vec::new(), Vec::new(), vec![NONE; problem.points.len()]);
@@ -145,18 +158,21 @@ impl Spherical {
             }
             starts[index + 1] += starts[index];
         }
-        let mut order = vec![0_u32; usable.len()];
-        for (position, (index, _)) in usable.iter().enumerate() {
-            let start = &mut starts[problem.observations[*index as usize].point as usize];
-            order[*start as usize] = position as u32;
-            *start += 1;
+        let mut order = vec![0_u32; usable];
+        for (index, observation) in problem.observations.iter().enumerate() {
+            if given[index].is_usable() {
+                let start = &mut starts[observation.point as usize];
+                order[*start as usize] = index as u32;
+                *start += 1;
+            }
         }
 
-        let mut is_block = vec![false; problem.poses.len()];
-        for (_, ray) in &usable {
-            is_block[ray.pose as usize] = true;
+        // A camera without observations is no unknown.
+        let mut is_seen = vec![false; problem.cameras.len()];
+        for (pose, _) in problem.poses.iter().zip(&is_block).filter(|(_, is_block)| **is_block) {
+            is_seen[pose.camera as usize] = true;
         }
-        let mut ignored = problem.observations.len() - usable.len();
+        let mut ignored = problem.observations.len() - usable;
         let mut priors = Vec::new();
         for prior in &problem.position_priors {
             let pose = prior.pose as usize;
@@ -186,11 +202,6 @@ impl Spherical {
             }
         }
 
-        // A camera without observations is no unknown.
-        let mut is_seen = vec![false; problem.cameras.len()];
-        for (_, ray) in &usable {
-            is_seen[problem.poses[ray.pose as usize].camera as usize] = true;
-        }
         let (mut intrinsics, mut extra_of_camera) = (Vec::new(), vec![NONE; problem.cameras.len()]);
         for (index, camera) in problem.cameras.iter().enumerate().filter(|&(index, _)| is_seen[index]) {
             let freedom = problem.camera_freedom.get(index).copied().unwrap_or(IntrinsicsFreedom::FIXED);
@@ -201,26 +212,24 @@ impl Spherical {
             }
         }
 
-        let (mut rays, mut links) = (Vec::with_capacity(usable.len()), Vec::with_capacity(usable.len()));
-        let mut pixel_rays = Vec::new();
-        for &position in &order {
-            let (index, ray) = usable[position as usize];
-            let observation = &problem.observations[index as usize];
-            let camera = problem.poses[ray.pose as usize].camera;
-            rays.push(ray);
-            links.push(Link {
+        let link = |observation: &BundleObservation| {
+            let camera = problem.poses[observation.pose as usize].camera;
+            Link {
                 point: compact[observation.point as usize],
-                block: block_of_pose[ray.pose as usize],
+                block: block_of_pose[observation.pose as usize],
                 extra: extra_of_camera[camera as usize],
-            });
-            if !intrinsics.is_empty() {
-                pixel_rays.push(PixelRay {
-                    camera,
-                    pixel: observation.pixel,
-                    noise_px: observation.noise_px,
-                });
             }
-        }
+        };
+        let pixel_ray = |&index: &u32| {
+            let &BundleObservation { pose, pixel, noise_px, .. } = &problem.observations[index as usize];
+            PixelRay { camera: problem.poses[pose as usize].camera, pixel, noise_px }
+        };
+        let in_order = || order.par_iter().with_min_len(4 * OBSERVATIONS_PER_TASK);
+        let (mut links, mut rays) = (Vec::new(), Vec::new());
+        in_order()
+            .map(|&index| (link(&problem.observations[index as usize]), given[index as usize]))
+            .unzip_into_vecs(&mut links, &mut rays);
+        let pixel_rays = if intrinsics.is_empty() { Vec::new() } else { in_order().map(pixel_ray).collect() };
 
         let poses: Vec<_> = problem.poses.iter().map(|pose| PoseState::new(pose.world_from_camera)).collect();
         let structure = Structure {

@@ -1,7 +1,6 @@
 use rayon::prelude::*;
 
 use super::model::{Model, ModelPoint};
-use super::structure::POINTS_PER_TASK;
 use crate::{
     ImageId, Observation, PointId,
     bundle::{
@@ -49,6 +48,9 @@ impl Scope {
         Self { free_images: others, points, intrinsics: false }
     }
 }
+
+/// Observations that are worth handing to another thread.
+const OBSERVATIONS_PER_TASK: usize = 2048;
 
 /// Points that an image must see for its pose to be adjusted.
 pub(crate) const MIN_ADJUSTABLE_POINTS: usize = 12;
@@ -103,18 +105,17 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
         scope.points.iter().filter_map(|&id| Some((id, model.point(id)?))).collect();
     problem.points =
         kept.iter().map(|(_, point)| BundlePoint { position: point.position, fixed: false }).collect();
-    let sighting = |index: usize, seen: &Observation| {
+    let mut sightings: Vec<(u32, u32, Observation)> = Vec::new();
+    for (index, (_, point)) in kept.iter().enumerate() {
+        let pose = |seen: &Observation| Some((pose_of_image[seen.image.index()]?, index as u32, *seen));
+        sightings.extend(point.track.iter().filter_map(pose));
+    }
+    let observation = |&(pose, point, seen): &(u32, u32, Observation)| {
         let keypoint = &model.input.images[seen.image.index()].features.keypoints[seen.feature as usize];
-        Some(BundleObservation {
-            pose: pose_of_image[seen.image.index()]?,
-            point: index as u32,
-            pixel: keypoint.pixel(),
-            noise_px: f64::from(keypoint.noise_px),
-        })
+        BundleObservation { pose, point, pixel: keypoint.pixel(), noise_px: f64::from(keypoint.noise_px) }
     };
-    problem.observations = (kept.par_iter().with_min_len(POINTS_PER_TASK).enumerate())
-        .flat_map_iter(|(index, (_, point))| point.track.iter().filter_map(move |seen| sighting(index, seen)))
-        .collect();
+    problem.observations =
+        sightings.par_iter().with_min_len(OBSERVATIONS_PER_TASK).map(observation).collect();
     let kept: Vec<PointId> = kept.into_iter().map(|(id, _)| id).collect();
     let report = bundle::solve(params, &mut problem);
 
