@@ -6,8 +6,6 @@ mod rigid;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use rayon::prelude::*;
-use setloc_index::NearestPoints;
 use setloc_sfm::{ImageId, Reconstruction};
 
 use crate::advice::widest_paths;
@@ -17,45 +15,27 @@ use crate::{
 
 use joint::{Component, ComponentAnswer};
 
-/// What is known of every photo before any local model is looked at.
-pub(crate) struct PhotoEvidence {
-    /// The scene points nearest to each feature.
-    nearest: Vec<NearestPoints>,
-    /// The photo alone.
-    alone: SingleLocalization,
-}
-
 /// Localizes a set through its local models (components of the photos' own reconstruction, largest first).
 ///
 /// Image ids of `local_models` are indices into `photos`; models with fewer than two registered photos are left out.
-/// `alone` is what [`locate_single`](crate::locate_single) says of each photo; photos beyond its end count as not
-/// localized. Every photo gets an answer: from the first model that localizes it, else alone. (L. Deng et al., "Image
-/// set querying based localization", VCIP 2015.)
+/// `alone` is what [`locate_single`](crate::locate_single) says of each photo; photos beyond its end are left out.
+/// Every other photo gets an answer: from the first model that localizes it, else alone. (L. Deng et al., "Image set
+/// querying based localization", VCIP 2015.)
 pub fn locate_set(
     params: &CamsetParams,
     scene: &Scene<'_>,
     photos: &[QueryPhoto<'_>],
-    alone: &[SingleLocalization],
+    alone: &[&SingleLocalization],
     local_models: &[Reconstruction],
     seed: u64,
 ) -> SetLocalization {
-    let evidence: Vec<PhotoEvidence> = photos
-        .par_iter()
-        .with_max_len(1)
-        .enumerate()
-        .map(|(number, photo)| {
-            let nearest = scene.index.nearest_points(&photo.features.descriptors);
-            let not_tried = || SingleLocalization::not_localized(photo, "it was not tried alone");
-            PhotoEvidence { nearest, alone: alone.get(number).cloned().unwrap_or_else(not_tried) }
-        })
-        .collect();
+    let photos = &photos[..photos.len().min(alone.len())];
+    let evidence = &alone[..photos.len()];
     let mut answer = SetLocalization::default();
     let mut rigid: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut refined: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
-    let mut scene_links: Vec<usize> = evidence
-        .iter()
-        .map(|e| e.alone.photo.world_from_camera.map_or(0, |_| e.alone.photo.inliers))
-        .collect();
+    let mut scene_links: Vec<usize> =
+        evidence.iter().map(|e| e.photo.world_from_camera.map_or(0, |_| e.photo.inliers)).collect();
     let mut photo_links: BTreeMap<(usize, usize), usize> = BTreeMap::new();
     for (number, model) in local_models.iter().enumerate() {
         let members: Vec<usize> =
@@ -67,7 +47,7 @@ pub fn locate_set(
             *photo_links.entry(pair).or_default() += shared;
         }
         let seed = seed.wrapping_add(0x1000 * (number as u64 + 1));
-        let component = Component { params, scene, photos, evidence: &evidence, model, members: &members };
+        let component = Component { params, scene, photos, evidence, model, members: &members };
         match component.locate(seed) {
             ComponentAnswer::Localized(found) => {
                 answer.world_from_set.push(found.world_from_set);
@@ -93,8 +73,8 @@ pub fn locate_set(
     }
     let names: Vec<&str> = photos.iter().map(|photo| photo.name).collect();
     answer.paths = widest_paths(&names, &scene_links, &photo_links);
-    answer.rigid = or_alone(rigid, &evidence);
-    answer.refined = or_alone(refined, &evidence);
+    answer.rigid = or_alone(rigid, evidence);
+    answer.refined = or_alone(refined, evidence);
     for (photo, path) in answer.refined.iter_mut().zip(&answer.paths) {
         if photo.verdict == Verdict::NotLocalized {
             answer.advice.push(path.advice());
@@ -158,9 +138,12 @@ fn keep_better(kept: &mut Option<PhotoLocalization>, other: PhotoLocalization) {
 }
 
 /// Answers of the set, and where it has none, those of the photos alone.
-fn or_alone(answers: Vec<Option<PhotoLocalization>>, evidence: &[PhotoEvidence]) -> Vec<PhotoLocalization> {
-    let alone = |evidence: &PhotoEvidence| {
-        let mut alone = evidence.alone.photo.clone();
+fn or_alone(
+    answers: Vec<Option<PhotoLocalization>>,
+    evidence: &[&SingleLocalization],
+) -> Vec<PhotoLocalization> {
+    let alone = |evidence: &SingleLocalization| {
+        let mut alone = evidence.photo.clone();
         let origin = match alone.verdict {
             Verdict::NotLocalized => "neither its local model nor the photo alone is localized",
             _ => "localized alone: no local model of the set leads to it",
@@ -184,14 +167,20 @@ mod tests {
     use crate::test_scene::{Place, World, along_street};
     use crate::{CamsetMethod, SingleParams, locate_single};
 
-    fn alone(scene: &Scene<'_>, photos: &[QueryPhoto<'_>]) -> Vec<SingleLocalization> {
-        photos.iter().map(|photo| locate_single(&SingleParams::default(), scene, photo, 7)).collect()
+    fn locate_photos(
+        params: &CamsetParams,
+        scene: &Scene<'_>,
+        photos: &[QueryPhoto<'_>],
+        local_models: &[Reconstruction],
+        seed: u64,
+    ) -> SetLocalization {
+        let alone = photos.iter().map(|photo| locate_single(&SingleParams::default(), scene, photo, seed));
+        let alone: Vec<SingleLocalization> = alone.collect();
+        locate_set(params, scene, photos, &alone.iter().collect::<Vec<_>>(), local_models, seed)
     }
 
     fn locate(world: &World, params: &CamsetParams) -> SetLocalization {
-        let (scene, photos) = (world.scene(), world.queries());
-        let local = std::slice::from_ref(&world.local);
-        locate_set(params, &scene, &photos, &alone(&scene, &photos), local, 7)
+        locate_photos(params, &world.scene(), &world.queries(), std::slice::from_ref(&world.local), 7)
     }
 
     fn worst_errors(world: &World, photos: &[PhotoLocalization]) -> (f64, f64) {
@@ -288,10 +277,8 @@ mod tests {
         let world = World::chain(5, 0.2, 5);
         for seed in 0..10 {
             let elsewhere = World::chain(5, 0.2, 100 + seed);
-            let (scene, photos) = (world.scene(), elsewhere.queries());
-            let local = std::slice::from_ref(&elsewhere.local);
-            let alone = alone(&scene, &photos);
-            let found = locate_set(&CamsetParams::default(), &scene, &photos, &alone, local, seed);
+            let (photos, local) = (elsewhere.queries(), std::slice::from_ref(&elsewhere.local));
+            let found = locate_photos(&CamsetParams::default(), &world.scene(), &photos, local, seed);
             for photo in found.rigid.iter().chain(&found.refined) {
                 assert_eq!(photo.verdict, Verdict::NotLocalized, "{seed}: {photo:#?}");
             }
@@ -304,10 +291,8 @@ mod tests {
         let world = World::chain(5, 0.2, 5);
         for seed in 0..4 {
             let elsewhere = World::chain_in(&Place::street(3500, 5).shuffled(seed), 5, 0.2, 300 + seed);
-            let (scene, photos) = (world.scene(), elsewhere.queries());
-            let local = std::slice::from_ref(&elsewhere.local);
-            let alone = alone(&scene, &photos);
-            let found = locate_set(&CamsetParams::default(), &scene, &photos, &alone, local, seed);
+            let (photos, local) = (elsewhere.queries(), std::slice::from_ref(&elsewhere.local));
+            let found = locate_photos(&CamsetParams::default(), &world.scene(), &photos, local, seed);
             for photo in found.rigid.iter().chain(&found.refined) {
                 assert_ne!(photo.verdict, Verdict::Localized, "{seed}: {photo:#?}");
             }
@@ -330,9 +315,7 @@ mod tests {
     #[test]
     fn a_set_without_local_model_is_localized_photo_by_photo() {
         let world = World::chain(3, 0.2, 8);
-        let (scene, photos) = (world.scene(), world.queries());
-        let alone = alone(&scene, &photos);
-        let found = locate_set(&CamsetParams::default(), &scene, &photos, &alone, &[], 1);
+        let found = locate_photos(&CamsetParams::default(), &world.scene(), &world.queries(), &[], 1);
         assert!(found.world_from_set.is_empty());
         assert!(
             found.refined.iter().all(|photo| photo.verdict == Verdict::Localized),

@@ -41,6 +41,18 @@ pub fn locate_single(
     seed: u64,
 ) -> SingleLocalization {
     let nearest = scene.index.nearest_points(&photo.features.descriptors);
+    let (photo, inliers) = locate_with_nearest(params, scene, photo, &nearest, seed);
+    SingleLocalization { photo, inliers, nearest }
+}
+
+/// The answer and the matches that agree, where the nearest scene points of all features are known.
+fn locate_with_nearest(
+    params: &SingleParams,
+    scene: &Scene<'_>,
+    photo: &QueryPhoto<'_>,
+    nearest: &[NearestPoints],
+    seed: u64,
+) -> (PhotoLocalization, Vec<SceneMatch>) {
     // Simulated views tie photos to each other, and help once a pose is known. Before, they add less to a scene of which
     // each point was seen from several sides than the chance matches of so many more features take away.
     let matches: Vec<SceneMatch> = scene
@@ -55,18 +67,18 @@ pub fn locate_single(
             matches.len(),
             params.verdict.min_inliers
         );
-        return SingleLocalization::not_localized(photo, reason);
+        return (PhotoLocalization::not_localized(photo, reason), Vec::new());
     }
-    let Some(found) = solve(params, scene, photo, &nearest, &matches, seed) else {
+    let Some(found) = solve(params, scene, photo, nearest, &matches, seed) else {
         let reason = format!("no pose explains any of its {} matches to the scene", matches.len());
-        return SingleLocalization::not_localized(photo, reason);
+        return (PhotoLocalization::not_localized(photo, reason), Vec::new());
     };
     let mut reasons = Vec::new();
     let mut verdict = judge_support(&params.verdict, &found.evidence, &mut reasons);
     if verdict == Verdict::NotLocalized {
-        let mut refused = SingleLocalization::not_localized(photo, String::new());
-        (refused.photo.reasons, refused.photo.inliers) = (reasons, found.evidence.inliers);
-        return refused;
+        let mut refused = PhotoLocalization::not_localized(photo, String::new());
+        (refused.reasons, refused.inliers) = (reasons, found.evidence.inliers);
+        return (refused, Vec::new());
     }
     verdict = weaker(
         verdict,
@@ -81,7 +93,7 @@ pub fn locate_single(
         verdict,
         reasons,
     };
-    SingleLocalization { photo: answer, inliers: found.inliers }
+    (answer, found.inliers)
 }
 
 struct Hypothesis {

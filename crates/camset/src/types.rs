@@ -1,7 +1,7 @@
 use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, ImageFeatures};
-use setloc_index::SceneIndex;
+use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::{PointId, Reconstruction, Rigid, Similarity};
 
 use crate::PathToScene;
@@ -101,13 +101,8 @@ pub struct SingleLocalization {
     pub photo: PhotoLocalization,
     /// The scene points that it sees from there; empty when not localized.
     pub inliers: Vec<SceneMatch>,
-}
-
-impl SingleLocalization {
-    /// The answer "not localized", for one reason.
-    pub fn not_localized(photo: &QueryPhoto<'_>, reason: impl Into<String>) -> Self {
-        Self { photo: PhotoLocalization::not_localized(photo, reason), inliers: Vec::new() }
-    }
+    /// The scene points nearest to each of its features, wherever it is.
+    pub nearest: Vec<NearestPoints>,
 }
 
 /// Where the photos of a set are.

@@ -1,7 +1,8 @@
+use serde::{Deserialize, Serialize};
 use setloc_sfm::PointId;
 
 /// A scene point and its squared descriptor distance to a query.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Neighbour {
     /// The scene point.
     pub point: PointId,
@@ -10,7 +11,7 @@ pub struct Neighbour {
 }
 
 /// The nearest and second-nearest *distinct* scene points of a query.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct NearestPoints {
     /// The nearest point.
     pub first: Option<Neighbour>,

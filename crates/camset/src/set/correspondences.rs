@@ -6,10 +6,9 @@ use nalgebra::Vector3;
 use setloc_index::{LocalDescriptors, NearestPoints, SceneIndex};
 use setloc_sfm::{PointId, Reconstruction, Rigid, Similarity};
 
-use super::PhotoEvidence;
 use crate::evidence::PhotoRays;
 use crate::observability::SetRay;
-use crate::{CamsetParams, Verdict};
+use crate::{CamsetParams, SingleLocalization, Verdict};
 
 /// A scene point and the features of the set that are believed to see it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -28,7 +27,7 @@ pub(crate) fn correspondences(
     model: &Reconstruction,
     members: &[usize],
     rays: &[PhotoRays<'_>],
-    evidence: &[PhotoEvidence],
+    evidence: &[&SingleLocalization],
 ) -> Vec<SetCorrespondence> {
     let mut slot_of = vec![None; model.images.len()];
     for (slot, &photo) in members.iter().enumerate() {
@@ -67,7 +66,7 @@ pub(crate) fn correspondences(
     }
     // What a photo that is localized alone sees has been confirmed by its pose, the ratio test or not.
     for (slot, &photo) in members.iter().enumerate() {
-        let alone = &evidence[photo].alone;
+        let alone = evidence[photo];
         for seen in alone.inliers.iter().filter(|_| alone.photo.verdict == Verdict::Localized) {
             if used.insert(seen.point) {
                 let seen_by = vec![(slot, seen.feature)];

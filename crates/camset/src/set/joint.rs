@@ -7,7 +7,6 @@ use rayon::prelude::*;
 use setloc_features::{Camera, Keypoint};
 use setloc_sfm::{ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
 
-use super::PhotoEvidence;
 use super::correspondences::{SetCorrespondence, correspondences, set_rays};
 use super::rigid::{RigidPose, SetPhotos, rigid_pose};
 use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
@@ -15,7 +14,9 @@ use crate::guided::guided_matches;
 use crate::refine::{JointModel, JointObservations, JointPhoto, Sighting, TiedPoint, refine_jointly};
 use crate::single::{inliers, union};
 use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
-use crate::{CamsetParams, GuidedParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, Verdict};
+use crate::{
+    CamsetParams, GuidedParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, Verdict,
+};
 
 /// Correspondences in a minimal sample of the generalized pose with scale.
 const SAMPLE: usize = 4;
@@ -52,7 +53,7 @@ pub(crate) struct Component<'a> {
     pub params: &'a CamsetParams,
     pub scene: &'a Scene<'a>,
     pub photos: &'a [QueryPhoto<'a>],
-    pub evidence: &'a [PhotoEvidence],
+    pub evidence: &'a [&'a SingleLocalization],
     pub model: &'a Reconstruction,
     /// Photo indices by slot, ascending.
     pub members: &'a [usize],
@@ -575,7 +576,7 @@ impl Component<'_> {
     /// none is.
     fn seen_alone(&self, joint: &[JointPhoto], slot: usize, depth: f64) -> Option<bool> {
         let agreements = joint.iter().zip(self.members).filter_map(|(photo, &member)| {
-            let alone = &self.evidence[member].alone.photo;
+            let alone = &self.evidence[member].photo;
             let other = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized)?;
             (photo.standpoint == joint[slot].standpoint)
                 .then(|| same_pose(&photo.world_from_camera, &other, depth))

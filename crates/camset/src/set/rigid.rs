@@ -8,11 +8,10 @@ use setloc_sfm::robust::{
 use setloc_sfm::solvers::triangulation::length_along;
 use setloc_sfm::{ImageId, Reconstruction, ReconstructionPoint, Rigid, Similarity};
 
-use super::PhotoEvidence;
 use super::correspondences::{SetCorrespondence, SetRays};
 use crate::evidence::{median, same_pose};
 use crate::observability::{Observability, observability, refine_similarity};
-use crate::{CamsetMethod, CamsetParams, Verdict};
+use crate::{CamsetMethod, CamsetParams, SingleLocalization, Verdict};
 
 /// The rigid pose with its support.
 pub(crate) struct RigidPose {
@@ -28,7 +27,7 @@ pub(crate) struct RigidPose {
 pub(crate) struct SetPhotos<'a> {
     pub set_from_camera: &'a [Rigid],
     pub members: &'a [usize],
-    pub evidence: &'a [PhotoEvidence],
+    pub evidence: &'a [&'a SingleLocalization],
 }
 
 /// Finds the pose of greatest truncated score among those of the solver, those of photos localized alone and those
@@ -47,10 +46,10 @@ pub(crate) fn rigid_pose(
     candidates.extend(alignments(set_from_camera, members, evidence));
     for (slot, &photo) in members.iter().enumerate() {
         let in_set = &set_from_camera[slot];
-        let alone =
-            evidence[photo].alone.photo.world_from_camera.map(|in_world| {
-                Rigid::new(in_world.rotation * in_set.rotation.inverse(), in_world.translation)
-            });
+        let alone = evidence[photo]
+            .photo
+            .world_from_camera
+            .map(|in_world| Rigid::new(in_world.rotation * in_set.rotation.inverse(), in_world.translation));
         let view = rays.of_slot(slot);
         let sampled = view.absolute_pose(params, seed.wrapping_add(slot as u64));
         for axes_at_photo in alone.into_iter().chain(sampled) {
@@ -259,12 +258,16 @@ fn runner_up(
 }
 
 /// Poses of the set from each ordered pair of photos that are localized alone: one gives the rotation, both the scale.
-fn alignments(set_from_camera: &[Rigid], members: &[usize], evidence: &[PhotoEvidence]) -> Vec<Similarity> {
+fn alignments(
+    set_from_camera: &[Rigid],
+    members: &[usize],
+    evidence: &[&SingleLocalization],
+) -> Vec<Similarity> {
     let alone: Vec<(Rigid, Rigid)> = members
         .iter()
         .zip(set_from_camera)
-        .filter(|(photo, _)| evidence[**photo].alone.photo.verdict == Verdict::Localized)
-        .filter_map(|(&photo, &in_set)| Some((in_set, evidence[photo].alone.photo.world_from_camera?)))
+        .filter(|(photo, _)| evidence[**photo].photo.verdict == Verdict::Localized)
+        .filter_map(|(&photo, &in_set)| Some((in_set, evidence[photo].photo.world_from_camera?)))
         .collect();
     let mut found = Vec::new();
     for (i, (first_in_set, first_in_world)) in alone.iter().enumerate() {

@@ -83,7 +83,7 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
         let by_itself = inputs.find::<SingleLocalization>(&format!("single {at:04}"))?;
         alone.push(by_itself.with_context(|| format!("{} was not located alone", photo.name))?);
     }
-    let alone: Vec<SingleLocalization> = alone.iter().map(|found| (**found).clone()).collect();
+    let alone: Vec<&SingleLocalization> = alone.iter().map(|found| &**found).collect();
     let queries: Vec<QueryPhoto<'_>> =
         features.iter().map(|(photo, features)| query(photo, features)).collect();
     let empty = Reconstruction::default();
