@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{Matrix3, Matrix6};
 use rayon::prelude::*;
 use setloc_features::{Camera, Keypoint};
-use setloc_sfm::{ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
+use setloc_sfm::{BaselineLength, ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
 
 use super::PhotoEvidence;
 use super::correspondences::{SetCorrespondence, correspondences, set_rays};
@@ -159,7 +159,8 @@ impl Component<'_> {
             rigid_support = Verdict::Uncertain;
         }
         let names: Vec<&str> = self.members.iter().map(|&photo| self.photos[photo].name).collect();
-        let remarks = vec![format!("the local model of {}: {}", names.join(", "), reasons.join("; "))];
+        let mut remarks = vec![format!("the local model of {}: {}", names.join(", "), reasons.join("; "))];
+        remarks.extend(self.lengths().map(|(slots, length)| self.basis(slots, &length)));
         let mut rigid_answers =
             self.rigid_answers(&set_from_camera, &candidates, &rigid, rigid_support, &reasons);
         // A photo that its own points do not hold in the refinement is held by nothing else before it.
@@ -176,6 +177,26 @@ impl Component<'_> {
             refined,
             remarks,
         }))
+    }
+
+    /// Lengths of baselines that the local points do not tell, and the slots that they lie between.
+    fn lengths(&self) -> impl Iterator<Item = ([usize; 3], BaselineLength)> + '_ {
+        let slot_of = |image: ImageId| self.members.binary_search(&image.index()).ok();
+        self.model.lengths.iter().filter_map(move |&length| {
+            let (images, _) = length.held();
+            let [reference, from, to] = images.map(slot_of);
+            Some(([reference?, from?, to?], length))
+        })
+    }
+
+    /// What such a length rests on, in words.
+    fn basis(&self, [_, from, to]: [usize; 3], length: &BaselineLength) -> String {
+        let [from, to] = [from, to].map(|slot| self.photos[self.members[slot]].name);
+        format!(
+            "the distance of {to} from {from} rests on planes that go on ({} points, ± {:.0} %), not on common points",
+            length.votes,
+            100.0 * length.deviation
+        )
     }
 
     fn camera_of(&self, slot: usize) -> usize {
@@ -278,6 +299,7 @@ impl Component<'_> {
                 .iter()
                 .map(|point| world_from_set.transform_point(&point.position))
                 .collect(),
+            lengths: self.lengths().map(|(slots, length)| (slots, length.held().1)).collect(),
         };
         let mut covariances = Vec::new();
         for round in 0..=self.params.rounds {
@@ -559,6 +581,10 @@ impl Component<'_> {
                     }
                     None => {}
                 }
+                let of_standpoint =
+                    |to: usize| joint.model.photos[to].standpoint == joint.model.photos[slot].standpoint;
+                let lengths = self.lengths().filter(|&([.., to], _)| of_standpoint(to));
+                reasons.extend(lengths.map(|(slots, length)| self.basis(slots, &length)));
                 let verdict = weaker(verdict, precision);
                 PhotoLocalization {
                     name: self.photos[photo].name.to_owned(),

@@ -64,8 +64,8 @@ struct Prior {
 pub(super) struct Spherical {
     loss: RobustLoss,
     rays: Vec<Ray>,
-    /// Parallel to `rays` when any intrinsics are free, else empty.
-    pixel_rays: Vec<PixelRay>,
+    /// Parallel to `rays` when any intrinsics are free, else empty; `None` where the bearing does not depend on them.
+    pixel_rays: Vec<Option<PixelRay>>,
     poses: Vec<PoseState>,
     candidate_poses: Vec<PoseState>,
     /// Poses of the blocks, ascending.
@@ -120,18 +120,34 @@ impl Spherical {
                 bearing_and_weight(camera, &observation.pixel, observation.noise_px)?;
             Some(Ray { pose: observation.pose, bearing, inverse_sigma })
         };
-        let usable: Vec<(u32, Ray)> = problem
+        let mut usable: Vec<(u32, Ray)> = problem
             .observations
             .par_iter()
             .with_min_len(OBSERVATIONS_PER_TASK)
             .enumerate()
             .filter_map(|(index, observation)| Some((index as u32, usable_ray(observation)?)))
             .collect();
+        let by_pixel = problem.observations.len();
+        let usable_bearing = |(index, seen): (usize, &super::BundleBearing)| {
+            let point = problem.points.get(seen.point as usize)?.position;
+            let sound = *pose_usable.get(seen.pose as usize)?
+                && (point.x + point.y + point.z).is_finite()
+                && (seen.bearing.norm_squared() - 1.0).abs() < 1e-9
+                && seen.sigma.is_finite()
+                && seen.sigma > 0.0;
+            let ray = Ray { pose: seen.pose, bearing: seen.bearing, inverse_sigma: 1.0 / seen.sigma };
+            sound.then_some(((by_pixel + index) as u32, ray))
+        };
+        usable.extend(problem.bearings.iter().enumerate().filter_map(usable_bearing));
+        let point_of = |index: u32| match problem.observations.get(index as usize) {
+            Some(observation) => observation.point as usize,
+            None => problem.bearings[index as usize - by_pixel].point as usize,
+        };
 
         // Counting sort by point; within a point the order given stays.
         let mut starts = vec![0_u32; problem.points.len() + 1];
         for (index, _) in &usable {
-            starts[problem.observations[*index as usize].point as usize + 1] += 1;
+            starts[point_of(*index) + 1] += 1;
         }
         let mut points = Vec::new();
         let (mut free, mut point_of_index, mut compact) =
@@ -147,7 +163,7 @@ impl Spherical {
         }
         let mut order = vec![0_u32; usable.len()];
         for (position, (index, _)) in usable.iter().enumerate() {
-            let start = &mut starts[problem.observations[*index as usize].point as usize];
+            let start = &mut starts[point_of(*index)];
             order[*start as usize] = position as u32;
             *start += 1;
         }
@@ -156,7 +172,7 @@ impl Spherical {
         for (_, ray) in &usable {
             is_block[ray.pose as usize] = true;
         }
-        let mut ignored = problem.observations.len() - usable.len();
+        let mut ignored = by_pixel + problem.bearings.len() - usable.len();
         let mut priors = Vec::new();
         for prior in &problem.position_priors {
             let pose = prior.pose as usize;
@@ -205,20 +221,20 @@ impl Spherical {
         let mut pixel_rays = Vec::new();
         for &position in &order {
             let (index, ray) = usable[position as usize];
-            let observation = &problem.observations[index as usize];
+            let observation = problem.observations.get(index as usize);
             let camera = problem.poses[ray.pose as usize].camera;
             rays.push(ray);
             links.push(Link {
-                point: compact[observation.point as usize],
+                point: compact[point_of(index)],
                 block: block_of_pose[ray.pose as usize],
-                extra: extra_of_camera[camera as usize],
+                extra: observation.map_or(NONE, |_| extra_of_camera[camera as usize]),
             });
             if !intrinsics.is_empty() {
-                pixel_rays.push(PixelRay {
+                pixel_rays.push(observation.map(|seen| PixelRay {
                     camera,
-                    pixel: observation.pixel,
-                    noise_px: observation.noise_px,
-                });
+                    pixel: seen.pixel,
+                    noise_px: seen.noise_px,
+                }));
             }
         }
 
@@ -281,8 +297,9 @@ impl Model<POSE_DIM> for Spherical {
         let (mut bearing, mut weight) = (ray.bearing, ray.inverse_sigma);
         let mut jacobian = None;
         if link.extra != NONE {
-            let PixelRay { camera, pixel, noise_px } = &self.pixel_rays[observation];
-            if let Some(of_camera) = unproject_with_jacobian(&self.cameras[*camera as usize], pixel) {
+            if let Some(PixelRay { camera, pixel, noise_px }) = &self.pixel_rays[observation]
+                && let Some(of_camera) = unproject_with_jacobian(&self.cameras[*camera as usize], pixel)
+            {
                 bearing = of_camera.bearing;
                 weight = 1.0 / (of_camera.pixel_angle * noise_px);
                 jacobian = Some(of_camera);
@@ -319,7 +336,7 @@ impl Model<POSE_DIM> for Spherical {
     fn squared_residual(&self, observation: usize, point: &Vector3<f64>) -> f64 {
         let ray = &self.rays[observation];
         let (mut bearing, mut weight) = (ray.bearing, ray.inverse_sigma);
-        if let Some(PixelRay { camera, pixel, noise_px }) = self.pixel_rays.get(observation) {
+        if let Some(Some(PixelRay { camera, pixel, noise_px })) = self.pixel_rays.get(observation) {
             let camera = &self.candidate_cameras[*camera as usize];
             match bearing_and_weight(camera, pixel, *noise_px) {
                 Some(of_camera) => (bearing, weight) = of_camera,
