@@ -123,19 +123,9 @@ pub(super) fn continue_planes(
         return None;
     }
     let pair = Pair::new(model, image, other, (image_from_other, verified), seed);
-    eprintln!(
-        "DBG {} -> {} known {} planes {:?} matches {} points {} baseline {baseline:.3} dir {:?} rot change {:.3}",
-        other.0,
-        image.0,
-        known.len(),
-        planes.iter().map(|p| (p.members.len(), p.distance)).collect::<Vec<_>>(),
-        verified.len(),
-        pair.matches.len(),
-        (pose.world_from_camera * pair.image_from_other.inverse()).translation - center,
-        pair.image_from_other.rotation.angle_to(&image_from_other.rotation).to_degrees()
-    );
     let votes = votes(&known, &planes, &pair.points(&pair.image_from_other), seed);
     let (length, agreeing) = length_of(&votes, seed)?;
+    let deviation = stated(&agreeing)?.hypot(pair.deviation(&agreeing)?);
     let world_from_image = pose.world_from_camera * pair.image_from_other.inverse();
     let step = world_from_image.translation - center;
     let votes = agreeing.len();
@@ -376,15 +366,6 @@ fn length_of(votes: &[Vote], seed: u64) -> Option<(f64, Vec<Vote>)> {
         votes.iter().map(|vote| (vote.plane_depth - vote.depth, vote.sigma)).collect();
     let (best, second) = peaks(&opinions)?;
     let chance = by_chance(votes, seed);
-    eprintln!(
-        "DBG votes {} best len {:.4} ll {:.1} n {:.1} second {:.1} chance {:.1}",
-        votes.len(),
-        best.length.exp(),
-        best.log_likelihood,
-        best.votes,
-        second,
-        chance
-    );
     let enough = best.votes >= MIN_VOTES && best.log_likelihood >= MIN_LOG_LIKELIHOOD;
     if !enough || best.log_likelihood < LEAD * second || best.log_likelihood < CHANCE_LEAD * chance {
         return None;
