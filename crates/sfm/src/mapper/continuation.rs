@@ -9,7 +9,7 @@
 //! Two things are asked before a point may vote for a plane. What stands across tells nothing (the end of a street is
 //! parallel to the front that one has just passed, and all its points agree on a wrong length): the plane must not be
 //! seen through, so points of the model near the ray must not lie behind it. And what lies on a plane of the pair itself
-//! with another normal is no continuation.
+//! with another normal is no continuation. Where all agree on a length unlike the model's own steps, none is taken.
 
 use nalgebra::Vector3;
 use rand::SeedableRng;
@@ -56,6 +56,9 @@ const MIN_LOG_LIKELIHOOD: f64 = 20.0;
 const LEAD: f64 = 3.0;
 /// How many times more it must be than for depths dealt out anew.
 const CHANCE_LEAD: f64 = 2.0;
+/// Largest factor between the length and that of the reference baseline. Who takes photos on the way somewhere takes
+/// steps of one kind; what gives another length is a wall that is parallel to a nearer one.
+const MAX_STEP_RATIO: f64 = 4.0;
 /// Lengths whose logarithms differ by less are one.
 const SAME_LENGTH: f64 = 0.15;
 /// How often depths are dealt out anew to see what chance gives.
@@ -125,11 +128,14 @@ pub(super) fn continue_planes(
     let pair = Pair::new(model, image, other, (image_from_other, verified), seed);
     let votes = votes(&known, &planes, &pair.points(&pair.image_from_other), seed);
     let (length, agreeing) = length_of(&votes, seed)?;
+    let ratio = length.exp() / baseline;
+    if !(MAX_STEP_RATIO.recip()..=MAX_STEP_RATIO).contains(&ratio) {
+        return None;
+    }
     let deviation = stated(&agreeing)?.hypot(pair.deviation(&agreeing)?);
     let world_from_image = pose.world_from_camera * pair.image_from_other.inverse();
     let step = world_from_image.translation - center;
     let votes = agreeing.len();
-    let ratio = length.exp() / baseline;
     Some(Continued {
         world_from_camera: Rigid::new(world_from_image.rotation, center + step * length.exp()),
         length: BaselineLength { reference, from: other, to: image, ratio, deviation, votes },
