@@ -383,21 +383,11 @@ impl<'a> Mapper<'a> {
 
     fn grow(&mut self) {
         loop {
-            let image = match self.next_image() {
-                Some((image, hypothesis)) => {
-                    register(&mut self.model, image, &hypothesis);
-                    image
-                }
-                None => {
-                    let found = (self.register_by_turn())
-                        .or_else(|| self.register_by_baseline())
-                        .or_else(|| self.register_by_planes());
-                    match found {
-                        Some(image) => image,
-                        None => break,
-                    }
-                }
-            };
+            let found = (self.register_next())
+                .or_else(|| self.register_by_turn())
+                .or_else(|| self.register_by_baseline())
+                .or_else(|| self.register_by_planes());
+            let Some(image) = found else { break };
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), image);
             let scope = Scope::local(&self.model, image, self.params.local_bundle_images);
             adjust(&mut self.model, &self.params.bundle(10), &scope);
@@ -415,6 +405,13 @@ impl<'a> Mapper<'a> {
                 self.expel_misplaced();
             }
         }
+    }
+
+    /// Registers the image whose points in the model support its pose best.
+    fn register_next(&mut self) -> Option<ImageId> {
+        let (image, hypothesis) = self.next_image()?;
+        register(&mut self.model, image, &hypothesis);
+        Some(image)
     }
 
     /// Registers an image at the standpoint of one that it is a mere turn away from.

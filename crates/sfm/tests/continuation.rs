@@ -169,7 +169,9 @@ impl Corner {
             let [a, b, c] = length.held().0.map(center);
             (c - b).norm() / (b - a).norm()
         };
-        let center = |image: ImageId| model.images[image.index()].world_from_camera.unwrap().translation;
+        let center = |image: ImageId| {
+            model.images[image.index()].world_from_camera.expect("is registered").translation
+        };
         let truth = ratio(&|image| self.truth[image.index()].translation);
         Some((length, (ratio(&center) / truth).ln(), (length.ratio / truth).ln()))
     }
@@ -238,7 +240,7 @@ fn it_can_be_switched_off_and_gives_the_same_twice() {
     let off = corner.map(&MapperParams { continue_planes: false, ..MapperParams::default() });
     assert_eq!(registered(&off), MODEL);
     let [first, second] = [1, 2].map(|threads| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         pool.install(|| corner.map(&MapperParams::default()))
     });
     assert_eq!(first, second);

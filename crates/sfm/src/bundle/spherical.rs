@@ -296,14 +296,13 @@ impl Model<POSE_DIM> for Spherical {
         let pose = &self.poses[ray.pose as usize];
         let (mut bearing, mut weight) = (ray.bearing, ray.inverse_sigma);
         let mut jacobian = None;
-        if link.extra != NONE {
-            if let Some(PixelRay { camera, pixel, noise_px }) = &self.pixel_rays[observation]
-                && let Some(of_camera) = unproject_with_jacobian(&self.cameras[*camera as usize], pixel)
-            {
-                bearing = of_camera.bearing;
-                weight = 1.0 / (of_camera.pixel_angle * noise_px);
-                jacobian = Some(of_camera);
-            }
+        if link.extra != NONE
+            && let Some(PixelRay { camera, pixel, noise_px }) = &self.pixel_rays[observation]
+            && let Some(of_camera) = unproject_with_jacobian(&self.cameras[*camera as usize], pixel)
+        {
+            bearing = of_camera.bearing;
+            weight = 1.0 / (of_camera.pixel_angle * noise_px);
+            jacobian = Some(of_camera);
         }
         let x = pose.camera_point(point);
         let angular = angular(&bearing, &x);
