@@ -38,5 +38,6 @@ pub use types::{
 /// 1: single photos, rigid sets, joint refinement. 2: moving scene points, baselines, stricter verdicts. 3: exact scene
 /// points hold still, standpoints move together, no pose without scale. 4: noise as the residuals show it. 5: sets by the
 /// places of their pixels. 6: covariances that the points bear out. 7: models mapped and aligned on all cores. 8: each
-/// covariance is asked of its own pose's points. 9: sets take over what is known of their photos alone.
-pub const VERSION: u32 = 9;
+/// covariance is asked of its own pose's points. 9: sets take over what is known of their photos alone. 10: lengths that
+/// planes tell hold the set's baselines.
+pub const VERSION: u32 = 10;

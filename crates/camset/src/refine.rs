@@ -7,7 +7,7 @@ use setloc_features::Camera;
 use setloc_index::SceneIndex;
 use setloc_sfm::bundle::{
     self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
-    RobustLoss,
+    LengthRatio, RobustLoss,
 };
 use setloc_sfm::{Place, PointId, Rigid};
 
@@ -29,6 +29,8 @@ pub(crate) struct JointModel {
     pub camera_fixed: Vec<bool>,
     pub photos: Vec<JointPhoto>,
     pub points: Vec<Vector3<f64>>,
+    /// Lengths of baselines that the points do not tell, between slots of photos.
+    pub lengths: Vec<([usize; 3], LengthRatio)>,
 }
 
 /// One photo of a joint model.
@@ -138,7 +140,10 @@ pub(crate) fn refine_jointly(
         }
     }
     let mut problem =
-        BundleProblem { cameras, camera_freedom, poses, points, observations, position_priors: Vec::new() };
+        BundleProblem { cameras, camera_freedom, poses, points, observations, ..BundleProblem::default() };
+    for (slots, length) in &model.lengths {
+        problem.hold_length(slots.map(|slot| standpoints.lead[slot] as u32), *length);
+    }
     let params = BundleParams { loss: RobustLoss::Cauchy(LOSS_SCALE), ..BundleParams::default() };
     bundle::solve(&params, &mut problem);
     let mut of_leads = vec![None; model.photos.len()];
@@ -260,6 +265,7 @@ fn state_real_noise(problem: &mut BundleProblem, origins: &[Origin], scene_point
         let observations = problem.observations.iter().zip(origins);
         let mut part = BundleProblem {
             observations: observations.filter(|(_, origin)| kept(**origin)).map(|(o, _)| *o).collect(),
+            bearings: Vec::new(),
             ..problem.clone()
         };
         let report = bundle::solve(&nothing, &mut part);
@@ -423,6 +429,7 @@ fn covariances(problem: &BundleProblem, photos: usize, loss: RobustLoss) -> Vec<
         // Only this pose and the far cameras keep observations, so the others drop out.
         let alone = BundleProblem {
             observations: problem.observations.iter().filter(ties).copied().collect(),
+            bearings: Vec::new(),
             ..problem.clone()
         };
         let covariance = bundle::covariance(&alone, loss, &[pose]);
@@ -449,6 +456,7 @@ mod tests {
             camera_fixed: vec![true],
             photos: vec![JointPhoto { camera: 0, world_from_camera: off, standpoint: 0 }],
             points: Vec::new(),
+            lengths: Vec::new(),
         };
         let rays = [PhotoRays::new(&view.features, &world.camera)];
         let seen = JointObservations { direct: vec![matches], ..JointObservations::default() };

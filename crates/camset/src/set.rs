@@ -227,6 +227,42 @@ mod tests {
     }
 
     #[test]
+    fn a_length_from_planes_is_held_and_its_uncertainty_is_the_targets() {
+        for (seed, error, deviation) in [(41, 0.0, 0.02), (42, 0.05, 0.03), (43, -0.05, 0.03)] {
+            let mut world = World::chain(7, 0.2, seed);
+            world.cut_last(error, deviation);
+            let found = locate(&world, &CamsetParams::default());
+            let target = &found.refined[6];
+            let pose = target.world_from_camera.expect("has a pose");
+            let baseline = world.photos[6].pose.translation - world.photos[5].pose.translation;
+            let along = baseline.normalize();
+            let off = (pose.translation - world.photos[6].pose.translation).dot(&along) / baseline.norm();
+            let of_center =
+                target.covariance.expect("the length is held").fixed_view::<3, 3>(3, 3).into_owned();
+            let sigma = along.dot(&(of_center * along)).sqrt() / baseline.norm();
+            assert!((off - error).abs() < 0.02, "{seed}: {off}");
+            assert!(sigma > 0.95 * deviation && sigma < 2.0 * deviation, "{seed}: {sigma}");
+            assert!(
+                found.advice.iter().any(|remark| remark.contains("rests on planes")),
+                "{:?}",
+                found.advice
+            );
+            assert!(target.reasons.iter().any(|reason| reason.contains("20 points")), "{:?}", target.reasons);
+            let link = found.paths[6].links.last().expect("hangs on the photo before");
+            assert!(link.shared >= 12, "{link:?}");
+        }
+    }
+
+    #[test]
+    fn a_length_from_planes_that_is_hardly_known_leaves_the_target_uncertain() {
+        let mut world = World::chain(7, 0.2, 44);
+        world.cut_last(0.3, 0.3);
+        let found = locate(&world, &CamsetParams::default());
+        assert_eq!(found.refined[5].verdict, Verdict::Localized);
+        assert_eq!(found.refined[6].verdict, Verdict::Uncertain, "{:#?}", found.refined[6]);
+    }
+
+    #[test]
     fn aligned_places_outdo_keypoints_that_err_alike() {
         let mut world = World::chain(9, 0.2, 3);
         world.stretch_keypoints(0.001);

@@ -116,6 +116,7 @@ fn solve(
         camera_fixed: vec![photo.camera_fixed],
         photos: vec![JointPhoto { camera: 0, world_from_camera: best.pose, standpoint: 0 }],
         points: Vec::new(),
+        lengths: Vec::new(),
     };
     refine(&mut model, scene.index, photo, matches, params.max_error_sigmas, false);
     let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);

@@ -7,8 +7,8 @@ use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoi
 use setloc_index::{IndexParams, SceneIndex};
 use setloc_sfm::synthetic::normal;
 use setloc_sfm::{
-    AlignedTrack, CameraId, ImageId, Observation, PointId, Reconstruction, ReconstructionImage,
-    ReconstructionPoint, Rigid, Similarity,
+    AlignedTrack, BaselineLength, CameraId, ImageId, Observation, PointId, Reconstruction,
+    ReconstructionImage, ReconstructionPoint, Rigid, Similarity,
 };
 
 use crate::{QueryPhoto, Scene, SceneMatch};
@@ -126,6 +126,7 @@ fn model_of(place: &Place, views: &[View], camera: &Camera) -> (Reconstruction, 
         cameras: vec![camera.clone()],
         images: views.iter().enumerate().map(image).collect(),
         points: tracks.into_iter().enumerate().filter(|(_, track)| track.len() >= 2).map(point).collect(),
+        lengths: Vec::new(),
     };
     (model, shown)
 }
@@ -225,6 +226,29 @@ impl World {
         for point in &mut self.local.points {
             point.position = drift[point.track[0].image.index()].transform_point(&point.position);
         }
+    }
+
+    /// Leaves the last photo nothing in common with any but the one before, in points that only these two see, and
+    /// records the length of its baseline as planes would tell it: `error` and `deviation` are of its logarithm.
+    pub(crate) fn cut_last(&mut self, error: f64, deviation: f64) {
+        let last = self.photos.len() as u32 - 1;
+        self.local.points.retain_mut(|point| {
+            let is_tie = point.track.iter().any(|seen| seen.image.0 == last);
+            if is_tie {
+                point.track.retain(|seen| seen.image.0 + 1 >= last);
+            }
+            point.track.len() >= 2
+        });
+        let center = |image: u32| self.local.images[image as usize].world_from_camera.unwrap().translation;
+        let [a, b, c] = [last - 2, last - 1, last].map(center);
+        self.local.lengths.push(BaselineLength {
+            reference: ImageId(last - 2),
+            from: ImageId(last - 1),
+            to: ImageId(last),
+            ratio: (c - b).norm() / (b - a).norm() * error.exp(),
+            deviation,
+            votes: 20,
+        });
     }
 
     /// Aligns the local points: each view shows them to `noise_px`.

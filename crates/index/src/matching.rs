@@ -195,6 +195,7 @@ mod tests {
                 })
                 .collect(),
             points: Vec::new(),
+            lengths: Vec::new(),
         };
         let mut truth = Vec::new();
         for _ in 0..points {

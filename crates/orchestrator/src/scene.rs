@@ -32,7 +32,7 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 5);
+serde_artifact!(SceneFile, "scene", 6);
 
 impl SceneFile {
     /// Reads a scene file.

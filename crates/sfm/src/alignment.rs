@@ -24,7 +24,7 @@ use setloc_features::{
 };
 
 use crate::{
-    AlignedTrack, ImageId, Observation, Place, Reconstruction, Rigid,
+    AlignedTrack, BaselineLength, ImageId, Observation, Place, Reconstruction, Rigid,
     bundle::{
         self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
         RobustLoss,
@@ -34,7 +34,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 7;
+pub const ALIGNMENT_VERSION: u32 = 8;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;
@@ -496,6 +496,12 @@ impl<'a> Tracks<'a> {
             let pose = pose_of_image[image.index()]?;
             Some(BundleObservation { pose, point: point as u32, pixel, noise_px })
         }));
+        for (images, length) in component.lengths.iter().map(BaselineLength::held) {
+            if let [Some(reference), Some(from), Some(to)] = images.map(|image| pose_of_image[image.index()])
+            {
+                problem.hold_length([reference, from, to], length);
+            }
+        }
         problem
     }
 

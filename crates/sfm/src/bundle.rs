@@ -23,6 +23,7 @@ pub mod bal;
 mod camera_system;
 mod elimination;
 mod iterative;
+mod length;
 mod levenberg_marquardt;
 mod loss;
 mod normal_equations;
@@ -39,10 +40,12 @@ use levenberg_marquardt::{Limits, Outcome, minimize};
 use normal_equations::NormalEquations;
 use spherical::{Layout, POSE_DIM, Spherical};
 
+pub use length::LengthRatio;
 pub use levenberg_marquardt::Termination;
 pub use loss::RobustLoss;
 pub use problem::{
-    BundleObservation, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom, PositionPrior,
+    BundleBearing, BundleObservation, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
+    PositionPrior,
 };
 
 /// S counts as singular when it has an eigenvalue below this, relative to the diagonal of JᵀJ.

@@ -27,7 +27,7 @@ pub use mapper::{
 };
 pub use quality::{PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess};
 pub use reconstruction::{
-    AlignedTrack, CameraId, ImageId, Observation, Place, PointId, Reconstruction, ReconstructionImage,
-    ReconstructionPoint,
+    AlignedTrack, BaselineLength, CameraId, ImageId, Observation, Place, PointId, Reconstruction,
+    ReconstructionImage, ReconstructionPoint,
 };
 pub use two_view::{PairGeometry, TWO_VIEW_VERSION, TwoView, TwoViewKind, TwoViewParams, verify_pair};

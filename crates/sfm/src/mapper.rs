@@ -1,11 +1,13 @@
 //! The incremental mapper: from verified pairs to components.
 
 mod adjust;
+mod continuation;
 mod correspondence;
 mod direction;
 mod initial;
 mod merge;
 mod model;
+mod plane;
 mod register;
 mod standpoint;
 mod structure;
@@ -25,6 +27,7 @@ pub use self::{
 
 use self::{
     adjust::{Scope, adjust, is_adjustable},
+    continuation::{Continued, continue_planes},
     correspondence::CorrespondenceGraph,
     model::Model,
     register::{
@@ -32,16 +35,17 @@ use self::{
         hypothesize_from_pairs, register, visibility,
     },
     standpoint::Standpoints,
-    structure::{PointLimits, complete_and_merge, filter, triangulate_image},
+    structure::{PointLimits, complete_and_merge, filter, triangulate_image, triangulate_match},
 };
 use crate::{
-    CameraId, Georegistration, ImageId, PairGeometry, Reconstruction, Rigid, TwoViewKind, TwoViewParams,
+    BaselineLength, CameraId, Georegistration, ImageId, Observation, PairGeometry, Reconstruction, Rigid,
+    TwoViewKind, TwoViewParams,
     bundle::{BundleParams, RobustLoss},
     robust::RansacParams,
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 8;
+pub const MAPPER_VERSION: u32 = 9;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -88,6 +92,9 @@ pub struct MapperParams {
     pub global_bundle_growth: f64,
     /// Scale of the Cauchy loss in standard deviations.
     pub loss_sigma: f64,
+    /// Whether an image that shares nothing with more than one other gets the length of its baseline from planes of the
+    /// model that go on. It applies to local models of photo sets only.
+    pub continue_planes: bool,
 }
 
 impl Default for MapperParams {
@@ -112,6 +119,7 @@ impl Default for MapperParams {
             local_bundle_images: 5,
             global_bundle_growth: 1.4,
             loss_sigma: 1.0,
+            continue_planes: true,
         }
     }
 }
@@ -290,6 +298,15 @@ fn enabled_pairs(input: &MapperInput<'_>, taken: &[bool]) -> Vec<bool> {
     input.pairs.iter().map(|pair| !taken[pair.first.index()] && !taken[pair.second.index()]).collect()
 }
 
+/// A verified pair of a registered image and one that waits.
+struct Edge {
+    /// Index of the pair.
+    pair: usize,
+    image: ImageId,
+    other: ImageId,
+    image_from_other: Rigid,
+}
+
 struct Mapper<'a> {
     params: &'a MapperParams,
     model: Model<'a>,
@@ -302,6 +319,8 @@ struct Mapper<'a> {
     refused_at: Vec<usize>,
     /// Points that a registered image had when the baseline of a pair (by index) was last sought.
     baseline_tried: BTreeMap<usize, usize>,
+    /// The same for planes.
+    planes_tried: BTreeMap<usize, usize>,
     records: Vec<RegistrationRecord>,
     images_at_last_global: usize,
     seed: u64,
@@ -333,6 +352,7 @@ impl<'a> Mapper<'a> {
             anchors: vec![None; input.images.len()],
             refused_at: vec![0; input.images.len()],
             baseline_tried: BTreeMap::new(),
+            planes_tried: BTreeMap::new(),
             records: Vec::new(),
             seed,
         }
@@ -363,16 +383,11 @@ impl<'a> Mapper<'a> {
 
     fn grow(&mut self) {
         loop {
-            let image = match self.next_image() {
-                Some((image, hypothesis)) => {
-                    register(&mut self.model, image, &hypothesis);
-                    image
-                }
-                None => match self.register_by_turn().or_else(|| self.register_by_baseline()) {
-                    Some(image) => image,
-                    None => break,
-                },
-            };
+            let found = (self.register_next())
+                .or_else(|| self.register_by_turn())
+                .or_else(|| self.register_by_baseline())
+                .or_else(|| self.register_by_planes());
+            let Some(image) = found else { break };
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), image);
             let scope = Scope::local(&self.model, image, self.params.local_bundle_images);
             adjust(&mut self.model, &self.params.bundle(10), &scope);
@@ -390,6 +405,13 @@ impl<'a> Mapper<'a> {
                 self.expel_misplaced();
             }
         }
+    }
+
+    /// Registers the image whose points in the model support its pose best.
+    fn register_next(&mut self) -> Option<ImageId> {
+        let (image, hypothesis) = self.next_image()?;
+        register(&mut self.model, image, &hypothesis);
+        Some(image)
     }
 
     /// Registers an image at the standpoint of one that it is a mere turn away from.
@@ -428,23 +450,13 @@ impl<'a> Mapper<'a> {
     /// agree on.
     fn register_by_baseline(&mut self) -> Option<ImageId> {
         let mut best: Option<(usize, ImageId, PoseHypothesis)> = None;
-        for (index, pair) in self.model.input.pairs.iter().enumerate() {
-            let image = if self.model.is_registered(pair.first) { pair.second } else { pair.first };
-            let Some((other, image_from_other)) = pair.seen_from(image) else { continue };
-            if self.model.is_registered(image)
-                || !self.model.is_registered(other)
-                || self.taken[image.index()]
-                || pair.two_view.kind == TwoViewKind::PureRotation
-                || pair.two_view.inliers.len() < self.params.min_initial_points
-            {
-                continue;
-            }
+        for edge in self.open_edges() {
             // Nothing new can be found until the other image has other points.
-            let points = self.model.observed_points(other);
-            if self.baseline_tried.get(&index) == Some(&points) {
+            let points = self.model.observed_points(edge.other);
+            if self.baseline_tried.insert(edge.pair, points) == Some(points) {
                 continue;
             }
-            self.baseline_tried.insert(index, points);
+            let Edge { image, other, image_from_other, .. } = edge;
             let hypothesis =
                 hypothesize_baseline(&self.model, image, other, &image_from_other, &self.params.ransac());
             if let Some(pose) = hypothesis
@@ -460,6 +472,62 @@ impl<'a> Mapper<'a> {
         let pose = pose?;
         register(&mut self.model, image, &pose);
         Some(image)
+    }
+
+    /// Registers an image by one verified pair whose baseline gets its length from planes of the model that go on.
+    fn register_by_planes(&mut self) -> Option<ImageId> {
+        if !self.params.continue_planes {
+            return None;
+        }
+        let mut best: Option<Continued> = None;
+        for edge in self.open_edges() {
+            let points = self.model.observed_points(edge.other);
+            if self.planes_tried.insert(edge.pair, points) == Some(points) {
+                continue;
+            }
+            let Edge { pair, image, other, image_from_other } = edge;
+            let PairGeometry { first, two_view, .. } = &self.model.input.pairs[pair];
+            let turned = |m: &Match| if *first == other { *m } else { m.swapped() };
+            let verified: Vec<Match> = two_view.inliers.iter().map(turned).collect();
+            let seed = self.seed ^ ((pair as u64) << 32);
+            let found = continue_planes(&self.model, image, other, (&image_from_other, &verified), seed);
+            if let Some(found) = found
+                && best.as_ref().is_none_or(|best| found.length.votes > best.length.votes)
+            {
+                best = Some(found);
+            }
+        }
+        let Continued { world_from_camera, length, matches } = best?;
+        let BaselineLength { from, to: image, votes, .. } = length;
+        let visibility = visibility(&self.model, image, &world_from_camera, &[]);
+        let hypothesis =
+            PoseHypothesis { world_from_camera, inliers: Vec::new(), candidates: votes, visibility };
+        let mut records = Vec::new();
+        let pose = self.first_accepted(image, vec![hypothesis], &mut records);
+        self.records.append(&mut records);
+        register(&mut self.model, image, &pose?);
+        self.model.lengths.push(length);
+        for m in matches {
+            let [a, b] =
+                [(from, m.first), (image, m.second)].map(|(image, feature)| Observation { image, feature });
+            triangulate_match(&mut self.model, self.params.limits(), a, b);
+        }
+        Some(image)
+    }
+
+    /// Verified pairs with parallax from a registered image to one that waits.
+    fn open_edges(&self) -> Vec<Edge> {
+        let open = |(index, pair): (usize, &PairGeometry)| {
+            let image = if self.model.is_registered(pair.first) { pair.second } else { pair.first };
+            let (other, image_from_other) = pair.seen_from(image)?;
+            let is_open = !self.model.is_registered(image)
+                && self.model.is_registered(other)
+                && !self.taken[image.index()]
+                && pair.two_view.kind != TwoViewKind::PureRotation
+                && pair.two_view.inliers.len() >= self.params.min_initial_points;
+            is_open.then_some(Edge { pair: index, image, other, image_from_other })
+        };
+        self.model.input.pairs.iter().enumerate().filter_map(open).collect()
     }
 
     fn place_by_turn(&mut self, image: ImageId) {

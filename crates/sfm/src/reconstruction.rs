@@ -2,7 +2,7 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, Keypoint};
 
-use crate::{Rigid, Similarity};
+use crate::{Rigid, Similarity, bundle::LengthRatio};
 
 macro_rules! id {
     ($name:ident, $doc:literal) => {
@@ -83,6 +83,38 @@ pub struct Place {
     pub noise_px: f64,
 }
 
+/// The length of a baseline that no common points tell but surfaces that go on; see [`crate::MapperParams`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct BaselineLength {
+    /// Where the baseline begins that it is compared with.
+    pub reference: ImageId,
+    /// Where that one ends and this one begins.
+    pub from: ImageId,
+    /// Where this one ends.
+    pub to: ImageId,
+    /// Distance of `to` from `from`, divided by that of `from` from `reference`.
+    pub ratio: f64,
+    /// Standard deviation of its logarithm.
+    pub deviation: f64,
+    /// Points that agree on it.
+    pub votes: usize,
+}
+
+impl BaselineLength {
+    /// The three images, and the ratio as bundle adjustment takes it.
+    pub fn held(&self) -> ([ImageId; 3], LengthRatio) {
+        let length = LengthRatio { ratio: self.ratio, deviation: self.deviation };
+        ([self.reference, self.from, self.to], length)
+    }
+
+    /// The same between other images.
+    #[must_use]
+    pub fn between(self, image: impl Fn(ImageId) -> ImageId) -> Self {
+        let [reference, from, to] = [self.reference, self.from, self.to].map(image);
+        Self { reference, from, to, ..self }
+    }
+}
+
 /// One connected component of a scene or of a local model.
 ///
 /// `images` lists *all* input images in input order, so that ids mean the same in every component.
@@ -94,6 +126,8 @@ pub struct Reconstruction {
     pub images: Vec<ReconstructionImage>,
     /// Triangulated points.
     pub points: Vec<ReconstructionPoint>,
+    /// Lengths of baselines that the points do not tell.
+    pub lengths: Vec<BaselineLength>,
 }
 
 impl From<&Keypoint> for Place {
@@ -135,7 +169,9 @@ impl Reconstruction {
             point.track.sort_unstable();
         }
         let images = order.iter().map(|&at| self.images[at].clone()).collect();
-        Self { cameras: self.cameras.clone(), images, points }
+        let lengths =
+            self.lengths.iter().map(|length| length.between(|image| id_of[image.index()])).collect();
+        Self { cameras: self.cameras.clone(), images, points, lengths }
     }
 
     /// The camera of an image.
@@ -191,11 +227,20 @@ mod tests {
             cameras: Vec::new(),
             images: vec![image("c", 0), image("a", 1), image("b", 2)],
             points: vec![point(vec![seen(0, 7), seen(1, 8)]), point(vec![seen(1, 5), seen(2, 6)])],
+            lengths: vec![BaselineLength {
+                reference: ImageId(0),
+                from: ImageId(1),
+                to: ImageId(2),
+                ratio: 1.5,
+                deviation: 0.1,
+                votes: 20,
+            }],
         };
         let listed = model.by_name();
         assert_eq!(listed.images, [image("a", 1), image("b", 2), image("c", 0)]);
         assert_eq!(listed.points[0].track, [seen(0, 8), seen(2, 7)]);
         assert_eq!(listed.points[1].track, [seen(0, 5), seen(1, 6)]);
+        assert_eq!(listed.lengths[0].held().0, [ImageId(2), ImageId(0), ImageId(1)]);
         assert_eq!(listed.by_name(), listed);
     }
 }

@@ -111,7 +111,7 @@ impl Room {
                 }
             })
             .collect();
-        let model = Reconstruction { cameras: vec![camera], images, points };
+        let model = Reconstruction { cameras: vec![camera], images, points, lengths: Vec::new() };
         Self { truth, features, pyramids, model }
     }
 

@@ -313,20 +313,29 @@ impl<'a> Executor<'a> {
             if together.is_empty() {
                 return;
             }
-            let outputs: Vec<Output<'_>> = together.iter().map(Unkept::as_output).collect();
-            match self.options.store.keep(&outputs) {
-                Ok(()) => together.iter().for_each(|made| self.finished(made)),
-                Err(error) => {
-                    for Unkept { id, .. } in &together {
-                        let reason = format!("cannot keep the result of {}", self.graph.job(*id).label());
-                        let state = self.failed(*id, &anyhow::anyhow!("{error:#}").context(reason));
-                        let slot = &mut self.lock().slots[id.index()];
-                        (slot.state, slot.output) = (state, None);
-                    }
-                    self.lock().fatal.get_or_insert(error);
-                }
+            if self.keep_together(&together).is_ok() {
+                continue;
+            }
+            // Of what came together, some may still find room.
+            for made in &together {
+                let Err(error) = self.keep_together(std::slice::from_ref(made)) else { continue };
+                let reason = format!("cannot keep the result of {}", self.graph.job(made.id).label());
+                let state = self.failed(made.id, &anyhow::anyhow!("{error:#}").context(reason));
+                let mut shared = self.lock();
+                let slot = &mut shared.slots[made.id.index()];
+                (slot.state, slot.output) = (state, None);
+                shared.fatal.get_or_insert(error);
             }
         }
+    }
+
+    fn keep_together(&self, made: &[Unkept]) -> Result<()> {
+        let outputs: Vec<Output<'_>> = made.iter().map(Unkept::as_output).collect();
+        self.options.store.keep(&outputs)?;
+        for made in made {
+            self.finished(made);
+        }
+        Ok(())
     }
 
     /// Says that a job's result is kept.

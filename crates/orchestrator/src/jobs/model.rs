@@ -77,12 +77,16 @@ pub fn add_model(
     let cameras = share_cameras(images);
     let placed: Vec<_> =
         cameras.of_image.iter().zip(positions).map(|(camera, position)| json!([camera, position])).collect();
+    let mapper = MapperParams {
+        continue_planes: config.sfm.continue_planes && kind == ModelKind::Local,
+        ..config.sfm.clone()
+    };
     let params = json!({
-        "sfm": config.sfm, "two_view": config.two_view, "quality": config.quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "camera_fixed": cameras.fixed,
+        "sfm": mapper, "two_view": config.two_view, "quality": config.quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "camera_fixed": cameras.fixed,
     });
     let fixed = cameras.fixed.clone();
     let stage = ModelConfig {
-        mapper: config.sfm.clone(),
+        mapper: mapper.clone(),
         two_view: config.two_view.clone(),
         quality: config.quality.clone(),
         georegistration: config.georegistration.clone(),

@@ -59,6 +59,19 @@ pub struct BundleObservation {
     pub noise_px: f64,
 }
 
+/// A pose sees a point in a direction that is known without a camera model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BundleBearing {
+    /// Index into [`BundleProblem::poses`].
+    pub pose: u32,
+    /// Index into [`BundleProblem::points`].
+    pub point: u32,
+    /// Unit direction in the camera frame; it may lie outside of what the camera sees.
+    pub bearing: Vector3<f64>,
+    /// Standard deviation per tangent axis in radians.
+    pub sigma: f64,
+}
+
 /// A measured camera centre, as of GPS.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PositionPrior {
@@ -74,7 +87,7 @@ pub struct PositionPrior {
 
 /// Cameras, poses, points and what ties them together.
 ///
-/// Observations and priors that cannot be used (indices out of range, values that are not finite, pixels outside the
+/// Observations, bearings and priors that cannot be used (indices out of range, values that are not finite, pixels outside the
 /// camera's domain) are ignored and counted in the report.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct BundleProblem {
@@ -88,6 +101,8 @@ pub struct BundleProblem {
     pub points: Vec<BundlePoint>,
     /// Observations in any order.
     pub observations: Vec<BundleObservation>,
+    /// Observations by direction, in any order.
+    pub bearings: Vec<BundleBearing>,
     /// Measured camera centres.
     pub position_priors: Vec<PositionPrior>,
 }

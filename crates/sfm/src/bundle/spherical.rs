@@ -73,8 +73,8 @@ struct Prior {
 pub(super) struct Spherical {
     loss: RobustLoss,
     rays: Vec<Ray>,
-    /// Parallel to `rays` when any intrinsics are free, else empty.
-    pixel_rays: Vec<PixelRay>,
+    /// Parallel to `rays` when any intrinsics are free, else empty; `None` where the bearing does not depend on them.
+    pixel_rays: Vec<Option<PixelRay>>,
     poses: Vec<PoseState>,
     candidate_poses: Vec<PoseState>,
     /// Poses of the blocks, ascending.
@@ -129,20 +129,38 @@ impl Spherical {
                 bearing_and_weight(camera, &observation.pixel, observation.noise_px)?;
             Some(Ray { pose: observation.pose, bearing, inverse_sigma })
         };
-        let given: Vec<Ray> = problem
+        let mut given: Vec<Ray> = problem
             .observations
             .par_iter()
             .with_min_len(OBSERVATIONS_PER_TASK)
             .map(|observation| usable_ray(observation).unwrap_or(Ray::UNUSABLE))
             .collect();
+        let by_pixel = given.len();
+        let usable_bearing = |seen: &super::BundleBearing| {
+            let point = problem.points.get(seen.point as usize)?.position;
+            let sound = *pose_usable.get(seen.pose as usize)?
+                && (point.x + point.y + point.z).is_finite()
+                && (seen.bearing.norm_squared() - 1.0).abs() < 1e-9
+                && seen.sigma.is_finite()
+                && seen.sigma > 0.0;
+            sound.then(|| Ray { pose: seen.pose, bearing: seen.bearing, inverse_sigma: 1.0 / seen.sigma })
+        };
+        given.extend(problem.bearings.iter().map(|seen| usable_bearing(seen).unwrap_or(Ray::UNUSABLE)));
+        let point_of = |index: u32| match problem.observations.get(index as usize) {
+            Some(observation) => observation.point as usize,
+            None => problem.bearings[index as usize - by_pixel].point as usize,
+        };
 
         // Counting sort by point; within a point the order given stays.
         let mut starts = vec![0_u32; problem.points.len() + 1];
         let mut is_block = vec![false; problem.poses.len()];
-        for (observation, ray) in problem.observations.iter().zip(&given) {
-            if ray.is_usable() {
-                starts[observation.point as usize + 1] += 1;
-                is_block[observation.pose as usize] = true;
+        // A camera without observations is no unknown.
+        let mut is_seen = vec![false; problem.cameras.len()];
+        for (index, ray) in (0..).zip(&given).filter(|(_, ray)| ray.is_usable()) {
+            starts[point_of(index) + 1] += 1;
+            is_block[ray.pose as usize] = true;
+            if (index as usize) < by_pixel {
+                is_seen[problem.poses[ray.pose as usize].camera as usize] = true;
             }
         }
         let usable = starts.iter().map(|&count| count as usize).sum::<usize>();
@@ -159,20 +177,13 @@ impl Spherical {
             starts[index + 1] += starts[index];
         }
         let mut order = vec![0_u32; usable];
-        for (index, observation) in problem.observations.iter().enumerate() {
-            if given[index].is_usable() {
-                let start = &mut starts[observation.point as usize];
-                order[*start as usize] = index as u32;
-                *start += 1;
-            }
+        for (index, _) in (0..).zip(&given).filter(|(_, ray)| ray.is_usable()) {
+            let start = &mut starts[point_of(index)];
+            order[*start as usize] = index;
+            *start += 1;
         }
 
-        // A camera without observations is no unknown.
-        let mut is_seen = vec![false; problem.cameras.len()];
-        for (pose, _) in problem.poses.iter().zip(&is_block).filter(|(_, is_block)| **is_block) {
-            is_seen[pose.camera as usize] = true;
-        }
-        let mut ignored = problem.observations.len() - usable;
+        let mut ignored = given.len() - usable;
         let mut priors = Vec::new();
         for prior in &problem.position_priors {
             let pose = prior.pose as usize;
@@ -212,23 +223,25 @@ impl Spherical {
             }
         }
 
-        let link = |observation: &BundleObservation| {
-            let camera = problem.poses[observation.pose as usize].camera;
+        let link = |index: u32| {
+            let ray = given[index as usize];
+            let camera = problem.poses[ray.pose as usize].camera;
+            // What is given as a bearing does not depend on a camera.
+            let by_pixel = (index as usize) < by_pixel;
             Link {
-                point: compact[observation.point as usize],
-                block: block_of_pose[observation.pose as usize],
-                extra: extra_of_camera[camera as usize],
+                point: compact[point_of(index)],
+                block: block_of_pose[ray.pose as usize],
+                extra: if by_pixel { extra_of_camera[camera as usize] } else { NONE },
             }
         };
         let pixel_ray = |&index: &u32| {
-            let &BundleObservation { pose, pixel, noise_px, .. } = &problem.observations[index as usize];
-            PixelRay { camera: problem.poses[pose as usize].camera, pixel, noise_px }
+            let &BundleObservation { pose, pixel, noise_px, .. } =
+                problem.observations.get(index as usize)?;
+            Some(PixelRay { camera: problem.poses[pose as usize].camera, pixel, noise_px })
         };
         let in_order = || order.par_iter().with_min_len(4 * OBSERVATIONS_PER_TASK);
         let (mut links, mut rays) = (Vec::new(), Vec::new());
-        in_order()
-            .map(|&index| (link(&problem.observations[index as usize]), given[index as usize]))
-            .unzip_into_vecs(&mut links, &mut rays);
+        in_order().map(|&index| (link(index), given[index as usize])).unzip_into_vecs(&mut links, &mut rays);
         let pixel_rays = if intrinsics.is_empty() { Vec::new() } else { in_order().map(pixel_ray).collect() };
 
         let poses: Vec<_> = problem.poses.iter().map(|pose| PoseState::new(pose.world_from_camera)).collect();
@@ -289,13 +302,13 @@ impl Model<POSE_DIM> for Spherical {
         let pose = &self.poses[ray.pose as usize];
         let (mut bearing, mut weight) = (ray.bearing, ray.inverse_sigma);
         let mut jacobian = None;
-        if link.extra != NONE {
-            let PixelRay { camera, pixel, noise_px } = &self.pixel_rays[observation];
-            if let Some(of_camera) = unproject_with_jacobian(&self.cameras[*camera as usize], pixel) {
-                bearing = of_camera.bearing;
-                weight = 1.0 / (of_camera.pixel_angle * noise_px);
-                jacobian = Some(of_camera);
-            }
+        if link.extra != NONE
+            && let Some(PixelRay { camera, pixel, noise_px }) = &self.pixel_rays[observation]
+            && let Some(of_camera) = unproject_with_jacobian(&self.cameras[*camera as usize], pixel)
+        {
+            bearing = of_camera.bearing;
+            weight = 1.0 / (of_camera.pixel_angle * noise_px);
+            jacobian = Some(of_camera);
         }
         let x = pose.camera_point(point);
         let angular = angular(&bearing, &x);
@@ -328,7 +341,7 @@ impl Model<POSE_DIM> for Spherical {
     fn squared_residual(&self, observation: usize, point: &Vector3<f64>) -> f64 {
         let ray = &self.rays[observation];
         let (mut bearing, mut weight) = (ray.bearing, ray.inverse_sigma);
-        if let Some(PixelRay { camera, pixel, noise_px }) = self.pixel_rays.get(observation) {
+        if let Some(Some(PixelRay { camera, pixel, noise_px })) = self.pixel_rays.get(observation) {
             let camera = &self.candidate_cameras[*camera as usize];
             match bearing_and_weight(camera, pixel, *noise_px) {
                 Some(of_camera) => (bearing, weight) = of_camera,

@@ -4,8 +4,8 @@ use setloc_features::{Camera, Rays};
 
 use super::{InputImage, MapperInput};
 use crate::{
-    ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint, Rigid,
-    Similarity,
+    BaselineLength, ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint,
+    Rigid, Similarity,
     solvers::triangulation::{WorldRay, triangulate},
     visibility::is_same_view,
 };
@@ -44,6 +44,8 @@ pub(super) struct Model<'a> {
     pub poses: Vec<Option<Pose>>,
     /// Deleted points leave `None`, so that ids stay valid.
     pub points: Vec<Option<ModelPoint>>,
+    /// Lengths of baselines that the points do not tell.
+    pub lengths: Vec<BaselineLength>,
     point_of_feature: Vec<Vec<u32>>,
     /// The images that each was matched with, ascending; `None` where nothing is said of them.
     matched: Option<Vec<Vec<ImageId>>>,
@@ -93,6 +95,7 @@ impl<'a> Model<'a> {
         for point in &component.points {
             self.add_point(world_from_component.transform_point(&point.position), point.track.clone());
         }
+        self.lengths.extend(&component.lengths);
     }
 
     fn with_cameras(
@@ -111,6 +114,7 @@ impl<'a> Model<'a> {
             rays,
             poses: vec![None; input.images.len()],
             points: Vec::new(),
+            lengths: Vec::new(),
             point_of_feature: input.images.iter().map(|image| vec![NO_POINT; image.features.len()]).collect(),
             matched: (!input.putative.is_empty()).then(|| {
                 let mut matched = vec![Vec::new(); input.images.len()];
@@ -287,6 +291,7 @@ impl<'a> Model<'a> {
                 }
             }
         }
+        self.lengths.retain(|length| ![length.reference, length.from, length.to].contains(&image));
         self.set_pose(image, None);
     }
 
@@ -363,7 +368,7 @@ impl<'a> Model<'a> {
             }
         };
         let points = self.points.par_iter().flatten().map(finished).collect();
-        Reconstruction { cameras: self.cameras, images, points }
+        Reconstruction { cameras: self.cameras, images, points, lengths: self.lengths }
     }
 }
 

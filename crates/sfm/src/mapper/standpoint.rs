@@ -164,7 +164,9 @@ impl<'a> Standpoints<'a> {
         }
         let mut cameras = component.cameras;
         cameras.truncate(self.original.cameras.len());
-        Reconstruction { cameras, images, points }
+        let first_of = |image: ImageId| self.mosaics[image.index()].members[0].image;
+        let lengths = component.lengths.iter().map(|length| length.between(first_of)).collect();
+        Reconstruction { cameras, images, points, lengths }
     }
 
     fn add(&mut self, members: &[(ImageId, UnitQuaternion<f64>)], rays: &[Rays]) {

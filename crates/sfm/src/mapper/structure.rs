@@ -187,6 +187,18 @@ pub(super) fn connect(model: &mut Model<'_>, limits: PointLimits, a: Observation
     }
 }
 
+/// Makes matched keypoints observations of one point, a new one where neither has any.
+pub(super) fn triangulate_match(model: &mut Model<'_>, limits: PointLimits, a: Observation, b: Observation) {
+    if model.point_of(a).is_some() || model.point_of(b).is_some() {
+        connect(model, limits, a, b);
+    } else if let Some(found) = model.triangulate(&[a, b])
+        && found.max_error_sigma <= limits.max_error_sigma
+        && found.max_angle_rad >= limits.min_angle_rad
+    {
+        model.add_point(found.position, vec![a, b]);
+    }
+}
+
 fn complete(model: &mut Model<'_>, limits: PointLimits, id: PointId, partner: Observation) -> bool {
     let Some(point) = model.point(id) else { return false };
     let agrees = !sees(&point.track, partner.image)

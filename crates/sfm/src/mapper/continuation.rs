@@ -1,0 +1,475 @@
+//! The length of a baseline from planes that go on.
+//!
+//! Where an image shares nothing with any but one image of the model, and what it shares has no points yet, its rotation
+//! and the direction of its baseline are known and the length is not. But walls go on: what the two see lies on planes
+//! that the model has beside it. Each match, triangulated with a baseline of length one, meets the plane's continuation
+//! at a depth, and the quotient of the two depths is a vote for the length. The right length gathers votes of many
+//! directions; points of other surfaces scatter.
+//!
+//! Two things are asked before a point may vote for a plane. What stands across tells nothing (the end of a street is
+//! parallel to the front that one has just passed, and all its points agree on a wrong length): the plane must not be
+//! seen through, so points of the model near the ray must not lie behind it. And what lies on a plane of the pair itself
+//! with another normal is no continuation. Where all agree on a length unlike the model's own steps, none is taken.
+
+use nalgebra::Vector3;
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use setloc_features::{GuidedParams, Match, match_guided};
+
+use super::{
+    model::Model,
+    plane::{Plane, SeenPoint, find_planes},
+};
+use crate::{
+    BaselineLength, ImageId, Observation, Rigid,
+    robust::{RansacParams, estimate_relative_pose, refine_relative_pose},
+    solvers::{
+        essential::essential_from_pose,
+        triangulation::{WorldRay, triangulate},
+    },
+};
+
+/// Fewest points of a plane.
+const MIN_PLANE_POINTS: usize = 20;
+/// Largest standard deviation of the logarithm of a depth that votes.
+const MAX_VOTE_SIGMA: f64 = 0.15;
+/// Relief of walls, as a share of their distance: adds to the noise of each vote.
+const RELIEF: f64 = 0.01;
+/// Points of the model near a ray that say whether a plane is seen through there.
+const WITNESSES: usize = 5;
+/// How far behind a plane a point must lie to say so, as a share of the plane's distance.
+const BEHIND: f64 = 0.05;
+/// Largest angle between the normals of a plane of the model and its continuation, beside what noise leaves open.
+const MAX_NORMAL_RAD: f64 = 0.17;
+/// How far a plane may go on beyond its points, in distances from the image.
+const MAX_GAP: f64 = 2.0;
+/// Which of the nearest points of a plane tells how far it is to go on: one may be astray.
+const GAP_POINT: usize = 3;
+/// Range of the logarithm of lengths among which votes for nothing scatter.
+const RANGE: f64 = 6.0;
+/// Fewest votes that must agree.
+const MIN_VOTES: f64 = 9.0;
+/// Least logarithm of the likelihood of a length, relative to none.
+const MIN_LOG_LIKELIHOOD: f64 = 20.0;
+/// How many times more that must be than for any other length.
+const LEAD: f64 = 3.0;
+/// How many times more it must be than for depths dealt out anew.
+const CHANCE_LEAD: f64 = 2.0;
+/// Largest factor between the length and that of the reference baseline. Who takes photos on the way somewhere takes
+/// steps of one kind; what gives another length is a wall that is parallel to a nearer one.
+const MAX_STEP_RATIO: f64 = 4.0;
+/// Lengths whose logarithms differ by less are one.
+const SAME_LENGTH: f64 = 0.15;
+/// How often depths are dealt out anew to see what chance gives.
+const SHUFFLES: usize = 8;
+/// Most lengths that are compared.
+const MAX_CANDIDATES: usize = 160;
+/// Beyond its points by this share of its distance, a wall may have a step.
+const STEP_GAP: f64 = 0.1;
+/// Standard deviation of a wall's distance within its points and beyond, as a share of it.
+const STEP_DEVIATION: [f64; 2] = [0.02, 0.05];
+/// Votes that must lie within a plane's points to say that it is the same wall.
+const INSIDE: usize = 5;
+/// Fewest points that two images of a reference baseline share.
+const MIN_REFERENCE_POINTS: usize = 10;
+
+/// One match's opinion.
+#[derive(Debug, Clone, Copy)]
+struct Vote {
+    /// The match, by its place in the list.
+    found: usize,
+    /// Depth of the plane along the ray, and of the match at a baseline of length one: logarithms.
+    plane_depth: f64,
+    depth: f64,
+    /// Standard deviation of their difference.
+    sigma: f64,
+    /// How far the plane is to go on, in its distances from the image.
+    gap: f64,
+    /// What the plane's own noise leaves open there.
+    plane_sigma: f64,
+}
+
+/// A length that votes agree on.
+#[derive(Debug, Clone, Copy)]
+struct Peak {
+    /// Logarithm of the length.
+    length: f64,
+    log_likelihood: f64,
+    /// Votes that agree, each by its probability.
+    votes: f64,
+}
+
+/// An image's pose by planes that go on.
+pub(super) struct Continued {
+    pub world_from_camera: Rigid,
+    pub length: BaselineLength,
+    /// Matches of keypoints of the known image with its own that agree with the pose.
+    pub matches: Vec<Match>,
+}
+
+/// The pose of `image` from its verified geometry with the registered image `other`, where planes tell the length.
+pub(super) fn continue_planes(
+    model: &Model<'_>,
+    image: ImageId,
+    other: ImageId,
+    (image_from_other, verified): (&Rigid, &[Match]),
+    seed: u64,
+) -> Option<Continued> {
+    let pose = model.poses[other.index()].as_ref()?;
+    let reference = reference_of(model, other)?;
+    let center = *pose.center();
+    let baseline = (center - model.poses[reference.index()].as_ref()?.center()).norm();
+    let known: Vec<SeenPoint> = known_points(model, other, &center);
+    let planes = find_planes(&known, MIN_PLANE_POINTS, seed);
+    if planes.is_empty() {
+        return None;
+    }
+    let pair = Pair::new(model, image, other, (image_from_other, verified), seed);
+    let votes = votes(&known, &planes, &pair.points(&pair.image_from_other), seed);
+    let (length, agreeing) = length_of(&votes, seed)?;
+    let ratio = length.exp() / baseline;
+    if !(MAX_STEP_RATIO.recip()..=MAX_STEP_RATIO).contains(&ratio) {
+        return None;
+    }
+    let deviation = stated(&agreeing)?.hypot(pair.deviation(&agreeing)?);
+    let world_from_image = pose.world_from_camera * pair.image_from_other.inverse();
+    let step = world_from_image.translation - center;
+    let votes = agreeing.len();
+    Some(Continued {
+        world_from_camera: Rigid::new(world_from_image.rotation, center + step * length.exp()),
+        length: BaselineLength { reference, from: other, to: image, ratio, deviation, votes },
+        matches: pair.matches,
+    })
+}
+
+/// The image that shares most points with this one from another place.
+fn reference_of(model: &Model<'_>, image: ImageId) -> Option<ImageId> {
+    let center = model.poses[image.index()].as_ref()?.center();
+    let mut shared = vec![0_usize; model.poses.len()];
+    for (_, id) in model.observations_of(image) {
+        for seen in model.point(id).map_or(&[][..], |point| &point.track) {
+            shared[seen.image.index()] += 1;
+        }
+    }
+    let elsewhere = |other: &ImageId| {
+        model.poses[other.index()].as_ref().is_some_and(|pose| pose.center() != center)
+            && shared[other.index()] >= MIN_REFERENCE_POINTS
+    };
+    model
+        .registered()
+        .filter(elsewhere)
+        .max_by_key(|other| (shared[other.index()], std::cmp::Reverse(*other)))
+}
+
+fn known_points(model: &Model<'_>, image: ImageId, center: &Vector3<f64>) -> Vec<SeenPoint> {
+    let seen = |(_, id)| {
+        let point = model.point(id)?;
+        let rays: Vec<WorldRay> = point.track.iter().filter_map(|&seen| model.world_ray(seen)).collect();
+        SeenPoint::new(center, &point.position, &rays)
+    };
+    model.observations_of(image).into_iter().filter_map(seen).collect()
+}
+
+/// Two images, the second at a baseline of length one from the first.
+struct Pair<'m, 'a> {
+    model: &'m Model<'a>,
+    image: ImageId,
+    other: ImageId,
+    image_from_other: Rigid,
+    /// Matches that agree with it, of the other image with this one.
+    matches: Vec<Match>,
+}
+
+impl<'m, 'a> Pair<'m, 'a> {
+    /// The pair with more matches, and its geometry estimated from them.
+    ///
+    /// Where nearly all verified matches lie on one far wall, they fit baselines of many directions (off by 10–30° on
+    /// rendered street corners); what would tell them apart was refused by the ratio test over the whole image.
+    fn new(
+        model: &'m Model<'a>,
+        image: ImageId,
+        other: ImageId,
+        (image_from_other, verified): (&Rigid, &[Match]),
+        seed: u64,
+    ) -> Self {
+        let mut pair = Self { model, image, other, image_from_other: *image_from_other, matches: Vec::new() };
+        for (round, max_angle_rad) in BANDS_RAD.into_iter().enumerate() {
+            let guide = GuidedParams { max_angle_rad, ..GuidedParams::default() };
+            let essential = essential_from_pose(&pair.image_from_other);
+            let features =
+                |image: ImageId| (model.input.images[image.index()].features, &model.rays[image.index()]);
+            let mut matches = match_guided(&guide, features(other), features(image), &essential);
+            matches.extend_from_slice(verified);
+            matches.sort_unstable();
+            matches.dedup();
+            let [first, second] = pair.rays(&matches);
+            let seed = seed.wrapping_add(round as u64);
+            let estimate = estimate_relative_pose(&RANSAC, &first.0, &second.0, &first.1, &second.1, seed);
+            let Some(estimate) = estimate else { break };
+            pair.image_from_other = estimate.second_from_first;
+            pair.matches = estimate.inliers.iter().map(|&at| matches[at as usize]).collect();
+        }
+        pair.matches.dedup_by_key(|found| found.first);
+        pair
+    }
+
+    /// Bearings and their standard deviations of both sides of matches.
+    fn rays(&self, matches: &[Match]) -> [(Vec<Vector3<f64>>, Vec<f64>); 2] {
+        let side = |image: ImageId, feature: fn(&Match) -> u32| {
+            let rays = &self.model.rays[image.index()];
+            let ray = |found: &Match| {
+                (rays.bearings[feature(found) as usize], rays.sigmas[feature(found) as usize])
+            };
+            matches.iter().map(ray).unzip()
+        };
+        [side(self.other, |found| found.first), side(self.image, |found| found.second)]
+    }
+
+    /// What both see, with the place of each match in the list, at this relative pose.
+    fn points(&self, image_from_other: &Rigid) -> Vec<(usize, SeenPoint)> {
+        let numbered = self.matches.iter().enumerate();
+        numbered.filter_map(|(at, found)| Some((at, self.point(image_from_other, *found)?))).collect()
+    }
+
+    fn point(&self, image_from_other: &Rigid, found: Match) -> Option<SeenPoint> {
+        let world_from_other = self.model.poses[self.other.index()].as_ref()?.world_from_camera;
+        let first = self.model.world_ray(Observation { image: self.other, feature: found.first })?;
+        let rays = &self.model.rays[self.image.index()];
+        let (bearing, sigma) = (rays.bearings[found.second as usize], rays.sigmas[found.second as usize]);
+        let world_from_image = world_from_other * image_from_other.inverse();
+        let second = sigma.is_finite().then(|| WorldRay::new(&world_from_image, &bearing, sigma))?;
+        let position = triangulate(&[first, second])?;
+        let fits = |ray: &WorldRay| ray.angular_error(&position) <= RANSAC.max_error_sigma * ray.sigma;
+        let point = SeenPoint::new(&first.origin, &position, &[first, second])?;
+        (fits(&first) && fits(&second)).then_some(point)
+    }
+
+    /// Standard deviation of the mean of these votes that the noise of the matches makes, by their own depths and by
+    /// the pair's geometry: the delete-group jackknife.
+    fn deviation(&self, agreeing: &[Vote]) -> Option<f64> {
+        let [first, second] = self.rays(&self.matches);
+        let mut means = Vec::new();
+        for group in 0..GROUPS {
+            let kept: Vec<u32> =
+                (0..self.matches.len()).filter(|at| at % GROUPS != group).map(|at| at as u32).collect();
+            let without = refine_relative_pose(
+                &RANSAC,
+                &first.0,
+                &second.0,
+                &first.1,
+                &second.1,
+                &kept,
+                &self.image_from_other,
+            );
+            let (mut sum, mut weights) = (0.0, 0.0);
+            for vote in agreeing.iter().filter(|vote| vote.found % GROUPS != group) {
+                if let Some(point) = self.point(&without, self.matches[vote.found]) {
+                    let weight = vote.sigma.powi(-2);
+                    sum += weight * (vote.plane_depth - point.position.norm().ln());
+                    weights += weight;
+                }
+            }
+            means.push(sum / weights);
+        }
+        let middle = means.iter().sum::<f64>() / GROUPS as f64;
+        let squares: f64 = means.iter().map(|mean| (mean - middle).powi(2)).sum();
+        let deviation = ((GROUPS - 1) as f64 / GROUPS as f64 * squares).sqrt();
+        deviation.is_finite().then_some(deviation)
+    }
+}
+
+/// Half widths of the bands about the epipolar circles in which matches are sought, one after the other.
+const BANDS_RAD: [f64; 4] = [0.1, 0.02, 0.004, 0.004];
+/// How a pair's geometry is estimated from them.
+///
+/// A sample from one wall alone has the support of that wall, so drawing does not end with the first that has much.
+const RANSAC: RansacParams = RansacParams {
+    max_error_sigma: 4.0,
+    min_iterations: 1000,
+    max_iterations: 4000,
+    confidence: 0.9999,
+    min_inliers: 30,
+};
+/// Groups of matches of which each is left out once.
+const GROUPS: usize = 8;
+/// Standard deviation of the logarithm of a point's depth.
+fn depth_sigma(point: &SeenPoint) -> f64 {
+    let direction = point.position.normalize();
+    direction.dot(&(point.covariance * direction)).max(0.0).sqrt() / point.position.norm()
+}
+
+/// The votes of what a pair sees for planes among what its first image knows.
+fn votes(known: &[SeenPoint], planes: &[Plane], points: &[(usize, SeenPoint)], seed: u64) -> Vec<Vote> {
+    let (matches, points): (Vec<usize>, Vec<SeenPoint>) =
+        points.iter().filter(|(_, point)| depth_sigma(point) <= MAX_VOTE_SIGMA).copied().unzip();
+    let of_pair = find_planes(&points, MIN_PLANE_POINTS, seed ^ 1);
+    let mut own: Vec<Option<&Plane>> = vec![None; points.len()];
+    for plane in &of_pair {
+        for &member in &plane.members {
+            own[member] = Some(plane);
+        }
+    }
+    // Points on no plane may be mere chance.
+    let sound: Vec<&SeenPoint> =
+        planes.iter().flat_map(|plane| &plane.members).map(|&member| &known[member]).collect();
+    let directions: Vec<Vector3<f64>> = sound.iter().map(|point| point.position.normalize()).collect();
+    let mut near: Vec<(f64, usize)> = Vec::with_capacity(sound.len());
+    let mut found = Vec::new();
+    for ((found_at, point), own) in matches.into_iter().zip(&points).zip(own) {
+        let direction = point.position.normalize();
+        near.clear();
+        near.extend(directions.iter().enumerate().map(|(at, known)| (-known.dot(&direction), at)));
+        let count = WITNESSES.min(near.len());
+        near.select_nth_unstable_by(count - 1, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let witnesses: Vec<&SeenPoint> = near[..count].iter().map(|&(_, at)| sound[at]).collect();
+        let vote = |plane: &Plane| {
+            let depth = plane.depth_along(&direction)?;
+            let same_normal = own.is_none_or(|own| {
+                let angle = own.normal.dot(&plane.normal).abs().min(1.0).acos();
+                angle <= MAX_NORMAL_RAD + 2.0 * own.normal_sigma()
+            });
+            let seen_through = witnesses.iter().filter(|witness| plane.is_before(witness)).count();
+            if !same_normal || 2 * seen_through > witnesses.len() {
+                return None;
+            }
+            let place = direction * depth;
+            let gap = gap(known, plane, &place)?;
+            (gap <= MAX_GAP).then(|| Vote {
+                found: found_at,
+                plane_depth: depth.ln(),
+                depth: point.position.norm().ln(),
+                sigma: depth_sigma(point).hypot(RELIEF),
+                gap,
+                plane_sigma: plane.relative_sigma(&place),
+            })
+        };
+        found.extend(planes.iter().filter_map(vote).reduce(|a, b| if b.gap < a.gap { b } else { a }));
+    }
+    found
+}
+
+impl Plane {
+    /// Whether a point that the image sees lies behind this plane.
+    fn is_before(&self, point: &SeenPoint) -> bool {
+        let behind = self.normal.dot(&point.position) - self.distance;
+        let sigma = self.normal.dot(&(point.covariance * self.normal)).max(0.0).sqrt();
+        behind > (BEHIND * self.distance).max(3.0 * sigma)
+    }
+}
+
+/// How far a place of a plane is from the plane's points, in distances of the plane.
+fn gap(known: &[SeenPoint], plane: &Plane, place: &Vector3<f64>) -> Option<f64> {
+    let mut gaps: Vec<f64> =
+        plane.members.iter().map(|&member| (known[member].position - place).norm()).collect();
+    let at = GAP_POINT.min(gaps.len()).checked_sub(1)?;
+    Some(*gaps.select_nth_unstable_by(at, f64::total_cmp).1 / plane.distance)
+}
+
+/// The logarithm of the length that votes agree on, and those that do; `None` unless one length stands out.
+fn length_of(votes: &[Vote], seed: u64) -> Option<(f64, Vec<Vote>)> {
+    let opinions: Vec<(f64, f64)> =
+        votes.iter().map(|vote| (vote.plane_depth - vote.depth, vote.sigma)).collect();
+    let (best, second) = peaks(&opinions)?;
+    let chance = by_chance(votes, seed);
+    let enough = best.votes >= MIN_VOTES && best.log_likelihood >= MIN_LOG_LIKELIHOOD;
+    if !enough || best.log_likelihood < LEAD * second || best.log_likelihood < CHANCE_LEAD * chance {
+        return None;
+    }
+    let agreeing: Vec<Vote> = votes
+        .iter()
+        .filter(|vote| (vote.plane_depth - vote.depth - best.length).abs() <= 3.0 * vote.sigma)
+        .copied()
+        .collect();
+    Some((best.length, agreeing))
+}
+
+/// The best supported length, and the likelihood of the best that differs from it.
+fn peaks(opinions: &[(f64, f64)]) -> Option<(Peak, f64)> {
+    let mut lengths: Vec<f64> = opinions.iter().map(|(length, _)| *length).collect();
+    lengths.sort_by(f64::total_cmp);
+    let stride = lengths.len().div_ceil(MAX_CANDIDATES).max(1);
+    let candidates: Vec<Peak> =
+        lengths.iter().step_by(stride).map(|&length| support(opinions, length)).collect();
+    let mut best =
+        *candidates.iter().reduce(|a, b| if b.log_likelihood > a.log_likelihood { b } else { a })?;
+    for _ in 0..REFINEMENTS {
+        let refined = support(opinions, mean_near(opinions, best.length)?);
+        if refined.log_likelihood <= best.log_likelihood {
+            break;
+        }
+        best = refined;
+    }
+    let others = candidates.iter().filter(|other| (other.length - best.length).abs() > SAME_LENGTH);
+    Some((best, others.map(|other| other.log_likelihood).fold(0.0, f64::max)))
+}
+
+/// Most steps from the best vote to the mean of those round it.
+const REFINEMENTS: usize = 20;
+/// Steps of expectation maximization for the share of right votes.
+const MIXTURE_STEPS: usize = 12;
+
+/// Logarithm of the likelihood of a length, relative to votes that scatter over the whole range: a mixture of votes
+/// that are right within their noise and of others, in the proportion that suits best.
+fn support(opinions: &[(f64, f64)], length: f64) -> Peak {
+    let densities: Vec<f64> = opinions
+        .iter()
+        .map(|&(opinion, sigma)| {
+            let error = (opinion - length) / sigma;
+            RANGE * (-0.5 * error * error).exp() / (sigma * std::f64::consts::TAU.sqrt())
+        })
+        .collect();
+    let (mut share, mut votes) = (0.5, 0.0);
+    for _ in 0..MIXTURE_STEPS {
+        votes = densities.iter().map(|right| share * right / (share * right + 1.0 - share)).sum();
+        share = (votes / opinions.len() as f64).clamp(1e-3, 1.0 - 1e-3);
+    }
+    let log_likelihood = densities.iter().map(|right| (share * right + 1.0 - share).ln()).sum();
+    Peak { length, log_likelihood, votes }
+}
+
+/// Mean of the votes near a length, weighted by their noise and by how near they are.
+fn mean_near(opinions: &[(f64, f64)], length: f64) -> Option<f64> {
+    let (mut sum, mut weights) = (0.0, 0.0);
+    for &(opinion, sigma) in opinions {
+        let error = (opinion - length) / sigma;
+        let weight = (-0.5 * error * error).exp() / (sigma * sigma);
+        sum += weight * (opinion - length);
+        weights += weight;
+    }
+    (weights > 0.0).then(|| length + sum / weights)
+}
+
+/// The best likelihood of any length when the depths of the pair are dealt out anew among the votes.
+fn by_chance(votes: &[Vote], seed: u64) -> f64 {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 2);
+    let mut dealt: Vec<usize> = (0..votes.len()).collect();
+    let mut most = 0.0_f64;
+    for _ in 0..SHUFFLES {
+        dealt.shuffle(&mut rng);
+        let opinions: Vec<(f64, f64)> = votes
+            .iter()
+            .zip(&dealt)
+            .map(|(vote, &other)| (vote.plane_depth - votes[other].depth, vote.sigma.max(votes[other].sigma)))
+            .collect();
+        most = most.max(peaks(&opinions).map_or(0.0, |(best, _)| best.log_likelihood));
+    }
+    most
+}
+
+/// Standard deviation of the logarithm of a length by what these votes rest on.
+///
+/// Votes for one plane share its error, so their number does not count. What counts is what the noise of the plane's
+/// points leaves open at the votes, and how far the wall must go on: beyond its points it may have a step.
+fn stated(agreeing: &[Vote]) -> Option<f64> {
+    let mut gaps: Vec<f64> = agreeing.iter().map(|vote| vote.gap).collect();
+    let at = INSIDE.min(gaps.len()).checked_sub(1)?;
+    let gap = *gaps.select_nth_unstable_by(at, f64::total_cmp).1;
+    let [inside, beyond] = STEP_DEVIATION;
+    let step = if gap <= STEP_GAP { inside } else { beyond * gap.hypot(1.0) };
+    let mut of_planes: Vec<f64> = agreeing.iter().map(|vote| vote.plane_sigma).collect();
+    let middle = of_planes.len() / 2;
+    let of_plane = *of_planes.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let deviation = step.hypot(of_plane);
+    deviation.is_finite().then_some(deviation)
+}
