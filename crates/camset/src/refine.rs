@@ -148,6 +148,7 @@ pub(crate) fn refine_jointly(
     bundle::solve(&params, &mut problem);
     let mut of_leads = vec![None; model.photos.len()];
     if with_covariance {
+        leave_out_strays(&mut problem, &mut origins);
         state_real_noise(&mut problem, &origins, priors.len());
         bundle::solve(&params, &mut problem);
         let photos = model.photos.len();
@@ -249,6 +250,30 @@ impl Builder<'_> {
 const STATED_FREEDOM: f64 = 20.0;
 /// Least variance, relative to what keypoints state.
 const LEAST_VARIANCE: f64 = 0.25;
+
+/// Error in standard deviations of an observation that no pose explains.
+const STRAY_SIGMAS: f64 = 10.0;
+
+/// Leaves out observations of photos that the adjustment could not bring near its points.
+///
+/// A keypoint may agree with a scene point of large uncertainty and lie hundreds of its own deviations off the point's mean.
+/// The robust loss then hardly pulls, and what is left would stand for the noise of all.
+fn leave_out_strays(problem: &mut BundleProblem, origins: &mut Vec<Origin>) {
+    let is_stray = |seen: &BundleObservation| {
+        let BundlePose { camera, world_from_camera, .. } = &problem.poses[seen.pose as usize];
+        let camera = &problem.cameras[*camera as usize];
+        let point =
+            world_from_camera.inverse().transform_point(&problem.points[seen.point as usize].position);
+        let error = camera.unproject(&seen.pixel).map(|bearing| bearing.angle(&point));
+        let pixel = camera.pixel_angle(&seen.pixel);
+        !error.zip(pixel).is_some_and(|(error, pixel)| error <= STRAY_SIGMAS * pixel * seen.noise_px)
+    };
+    let kept: Vec<(BundleObservation, Origin)> = (problem.observations.iter().zip(origins.iter()))
+        .filter(|(seen, origin)| **origin == Origin::Far || !is_stray(seen))
+        .map(|(seen, origin)| (*seen, *origin))
+        .collect();
+    (problem.observations, *origins) = kept.into_iter().unzip();
+}
 
 /// Scales the noise of what ties the set to the scene and of what ties its photos by what their residuals show, each by
 /// itself.
@@ -465,6 +490,29 @@ mod tests {
         assert!(center < 0.03 && rotation < 0.1, "{center} {rotation}");
         let covariance = covariances[0].expect("fixed points leave nothing undetermined");
         assert!(covariance.trace() > 0.0 && covariance.trace() < 1e-3, "{covariance}");
+    }
+
+    #[test]
+    fn one_match_far_astray_does_not_stand_for_the_noise_of_all() {
+        let trace = |off_px: f32| {
+            let mut world = World::chain(1, 0.0, 32);
+            world.make_scene_exact();
+            let matches = world.scene_matches(0);
+            world.photos[0].features.keypoints[matches[3].feature as usize].x += off_px;
+            let view = &world.photos[0];
+            let mut model = JointModel {
+                cameras: vec![world.camera.clone()],
+                camera_fixed: vec![true],
+                photos: vec![JointPhoto { camera: 0, world_from_camera: view.pose, standpoint: 0 }],
+                points: Vec::new(),
+                lengths: Vec::new(),
+            };
+            let rays = [PhotoRays::new(&view.features, &world.camera)];
+            let seen = JointObservations { direct: vec![matches], ..JointObservations::default() };
+            refine_jointly(&mut model, &world.index, &rays, &seen, true)[0].expect("is determined").trace()
+        };
+        let ratio = trace(300.0) / trace(0.0);
+        assert!((0.8..1.25).contains(&ratio), "{ratio}");
     }
 
     #[test]
