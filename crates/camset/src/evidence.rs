@@ -82,7 +82,7 @@ impl<'a> PhotoRays<'a> {
 }
 
 /// Angular error between a bearing and the offset to a point, whitened by both uncertainties (both in one frame).
-fn ray_error_sigmas(
+pub(crate) fn ray_error_sigmas(
     bearing: &Vector3<f64>,
     sigma: f64,
     offset: &Vector3<f64>,

@@ -12,7 +12,7 @@ use setloc_sfm::bundle::{
 use setloc_sfm::{Place, PointId, Rigid};
 
 use crate::SceneMatch;
-use crate::evidence::PhotoRays;
+use crate::evidence::{PhotoRays, ray_error_sigmas};
 use crate::jackknife::honest_covariances;
 
 /// Scale of the robust loss in standard deviations: at one deviation an observation has half its weight, at four (an
@@ -256,17 +256,19 @@ const STRAY_SIGMAS: f64 = 10.0;
 
 /// Leaves out observations of photos that the adjustment could not bring near its points.
 ///
-/// A keypoint may agree with a scene point of large uncertainty and lie hundreds of its own deviations off the point's mean.
-/// The robust loss then hardly pulls, and what is left would stand for the noise of all.
+/// A keypoint may agree with a scene point of large uncertainty and lie hundreds of its own deviations off the point's
+/// mean. The robust loss then hardly pulls, and what is left would stand for the noise of all.
 fn leave_out_strays(problem: &mut BundleProblem, origins: &mut Vec<Origin>) {
     let is_stray = |seen: &BundleObservation| {
         let BundlePose { camera, world_from_camera, .. } = &problem.poses[seen.pose as usize];
         let camera = &problem.cameras[*camera as usize];
-        let point =
-            world_from_camera.inverse().transform_point(&problem.points[seen.point as usize].position);
-        let error = camera.unproject(&seen.pixel).map(|bearing| bearing.angle(&point));
-        let pixel = camera.pixel_angle(&seen.pixel);
-        !error.zip(pixel).is_some_and(|(error, pixel)| error <= STRAY_SIGMAS * pixel * seen.noise_px)
+        let ray = camera.unproject(&seen.pixel).zip(camera.pixel_angle(&seen.pixel));
+        let offset = problem.points[seen.point as usize].position - world_from_camera.translation;
+        let error = ray.map(|(bearing, angle)| {
+            let bearing = world_from_camera.rotation * bearing;
+            ray_error_sigmas(&bearing, angle * seen.noise_px, &offset, &Matrix3::zeros())
+        });
+        error.is_none_or(|error| error > STRAY_SIGMAS)
     };
     let kept: Vec<(BundleObservation, Origin)> = (problem.observations.iter().zip(origins.iter()))
         .filter(|(seen, origin)| **origin == Origin::Far || !is_stray(seen))

@@ -24,7 +24,7 @@ use setloc_features::{
 };
 
 use crate::{
-    AlignedTrack, BaselineLength, ImageId, Observation, Place, Reconstruction, Rigid,
+    AlignedTrack, ImageId, Observation, Place, Reconstruction, Rigid,
     bundle::{
         self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
         RobustLoss,
@@ -496,11 +496,8 @@ impl<'a> Tracks<'a> {
             let pose = pose_of_image[image.index()]?;
             Some(BundleObservation { pose, point: point as u32, pixel, noise_px })
         }));
-        for (images, length) in component.lengths.iter().map(BaselineLength::held) {
-            if let [Some(reference), Some(from), Some(to)] = images.map(|image| pose_of_image[image.index()])
-            {
-                problem.hold_length([reference, from, to], length);
-            }
+        for length in &component.lengths {
+            length.hold_in(&mut problem, |image| pose_of_image[image.index()]);
         }
         problem
     }

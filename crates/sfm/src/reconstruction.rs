@@ -2,7 +2,10 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, Keypoint};
 
-use crate::{Rigid, Similarity, bundle::LengthRatio};
+use crate::{
+    Rigid, Similarity,
+    bundle::{BundleProblem, LengthRatio},
+};
 
 macro_rules! id {
     ($name:ident, $doc:literal) => {
@@ -105,6 +108,14 @@ impl BaselineLength {
     pub fn held(&self) -> ([ImageId; 3], LengthRatio) {
         let length = LengthRatio { ratio: self.ratio, deviation: self.deviation };
         ([self.reference, self.from, self.to], length)
+    }
+
+    /// Holds it in an adjustment, where all three images take part in it.
+    pub(crate) fn hold_in(&self, problem: &mut BundleProblem, pose_of: impl Fn(ImageId) -> Option<u32>) {
+        let (images, length) = self.held();
+        if let [Some(reference), Some(from), Some(to)] = images.map(pose_of) {
+            problem.hold_length([reference, from, to], length);
+        }
     }
 
     /// The same between other images.

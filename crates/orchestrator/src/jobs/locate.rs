@@ -37,7 +37,8 @@ pub struct SetJobs {
     pub set: JobId,
 }
 
-/// Adds features, matches, local model, localization of each photo alone and of the set; `name` is what its jobs are called.
+/// Adds features, matches, local model, localization of each photo alone and of the set; `name` is what its jobs are
+/// called.
 ///
 /// # Errors
 /// When parameters have no JSON form.

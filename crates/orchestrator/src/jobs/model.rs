@@ -86,7 +86,7 @@ pub fn add_model(
     });
     let fixed = cameras.fixed.clone();
     let stage = ModelConfig {
-        mapper: mapper.clone(),
+        mapper,
         two_view: config.two_view.clone(),
         quality: config.quality.clone(),
         georegistration: config.georegistration.clone(),

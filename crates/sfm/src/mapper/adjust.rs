@@ -2,7 +2,7 @@ use rayon::prelude::*;
 
 use super::model::{Model, ModelPoint};
 use crate::{
-    BaselineLength, ImageId, Observation, PointId,
+    ImageId, Observation, PointId,
     bundle::{
         self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, BundleReport,
         IntrinsicsFreedom,
@@ -116,10 +116,8 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
     };
     problem.observations =
         sightings.par_iter().with_min_len(OBSERVATIONS_PER_TASK).map(observation).collect();
-    for (images, length) in model.lengths.iter().map(BaselineLength::held) {
-        if let [Some(reference), Some(from), Some(to)] = images.map(|image| pose_of_image[image.index()]) {
-            problem.hold_length([reference, from, to], length);
-        }
+    for length in &model.lengths {
+        length.hold_in(&mut problem, |image| pose_of_image[image.index()]);
     }
     let kept: Vec<PointId> = kept.into_iter().map(|(id, _)| id).collect();
     let report = bundle::solve(params, &mut problem);
