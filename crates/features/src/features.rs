@@ -113,19 +113,27 @@ impl ImageFeatures {
     /// Keypoints outside the domain of κ get the zero vector and an infinite standard deviation, so that no
     /// estimator can use them.
     pub fn rays(&self, camera: &Camera) -> Rays {
-        let mut rays =
-            Rays { bearings: Vec::with_capacity(self.len()), sigmas: Vec::with_capacity(self.len()) };
-        for keypoint in &self.keypoints {
-            let pixel = keypoint.pixel();
-            if let Some((bearing, angle)) = camera.unproject(&pixel).zip(camera.pixel_angle(&pixel)) {
-                rays.bearings.push(bearing);
-                rays.sigmas.push(angle * f64::from(keypoint.noise_px));
-            } else {
-                rays.bearings.push(Vector3::zeros());
-                rays.sigmas.push(f64::INFINITY);
-            }
+        let (bearings, sigmas) = self.keypoints.iter().map(|keypoint| ray(keypoint, camera)).unzip();
+        Rays { bearings, sigmas }
+    }
+
+    /// [`Self::rays`] of some keypoints by index, the others as where the camera model has no ray. Indices of no keypoint
+    /// are ignored.
+    pub fn rays_of(&self, camera: &Camera, keypoints: impl IntoIterator<Item = u32>) -> Rays {
+        let (bearings, sigmas) = (vec![Vector3::zeros(); self.len()], vec![f64::INFINITY; self.len()]);
+        let mut rays = Rays { bearings, sigmas };
+        for index in keypoints.into_iter().map(|index| index as usize).filter(|&index| index < self.len()) {
+            (rays.bearings[index], rays.sigmas[index]) = ray(&self.keypoints[index], camera);
         }
         rays
+    }
+}
+
+/// The bearing of a keypoint and its angular standard deviation.
+fn ray(keypoint: &Keypoint, camera: &Camera) -> (Vector3<f64>, f64) {
+    match camera.ray(&keypoint.pixel()) {
+        Some((bearing, angle)) => (bearing, angle * f64::from(keypoint.noise_px)),
+        None => (Vector3::zeros(), f64::INFINITY),
     }
 }
 

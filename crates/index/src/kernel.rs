@@ -8,10 +8,17 @@ use setloc_features::DESCRIPTOR_LEN;
 /// `base` has `out.len()` rows of [`DESCRIPTOR_LEN`] bytes; further rows are ignored.
 pub fn squared_distances(query: &[u8], base: &[u8], out: &mut [u32]) {
     #[cfg(target_arch = "x86_64")]
-    if is_x86_feature_detected!("avx2") {
-        // SAFETY: the processor has the only feature that the function asks for.
-        unsafe { squared_distances_avx2(query, base, out) };
-        return;
+    {
+        if is_x86_feature_detected!("avx512bw") && is_x86_feature_detected!("avx512vnni") {
+            // SAFETY: the processor has the features that the function asks for.
+            unsafe { squared_distances_avx512(query, base, out) };
+            return;
+        }
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has the only feature that the function asks for.
+            unsafe { squared_distances_avx2(query, base, out) };
+            return;
+        }
     }
     squared_distances_portable(query, base, out);
 }
@@ -20,6 +27,13 @@ pub fn squared_distances(query: &[u8], base: &[u8], out: &mut [u32]) {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
 fn squared_distances_avx2(query: &[u8], base: &[u8], out: &mut [u32]) {
+    squared_distances_portable(query, base, out);
+}
+
+/// The portable loop, compiled for 512-bit integer arithmetic with its multiply-accumulate.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
+fn squared_distances_avx512(query: &[u8], base: &[u8], out: &mut [u32]) {
     squared_distances_portable(query, base, out);
 }
 

@@ -1,6 +1,7 @@
 //! The incremental mapper: from verified pairs to components.
 
 mod adjust;
+mod ambiguity;
 mod continuation;
 mod correspondence;
 mod direction;
@@ -27,6 +28,7 @@ pub use self::{
 
 use self::{
     adjust::{Scope, adjust, is_adjustable},
+    ambiguity::settle_pose,
     continuation::{Continued, continue_planes},
     correspondence::CorrespondenceGraph,
     model::Model,
@@ -45,7 +47,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 9;
+pub const MAPPER_VERSION: u32 = 10;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -396,6 +398,7 @@ impl<'a> Mapper<'a> {
             let points = self.model.seen_by(&moved);
             filter(&mut self.model, self.params.limits(), &points);
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), image);
+            settle_pose(&mut self.model, &self.graph, self.params, image, self.seed);
             let count = self.model.registered_count();
             if count as f64 >= self.images_at_last_global as f64 * self.params.global_bundle_growth
                 || count <= 4
@@ -727,6 +730,9 @@ impl<'a> Mapper<'a> {
                 break;
             }
             self.grow();
+        }
+        for image in self.model.registered().collect::<Vec<_>>() {
+            settle_pose(&mut self.model, &self.graph, self.params, image, self.seed);
         }
         self.refine(4, 20);
         self.adjust_all(30);

@@ -13,7 +13,7 @@ mod ray_homography;
 mod relative_pose;
 mod residual;
 
-pub use absolute_pose::{AbsolutePoseEstimate, estimate_absolute_pose, refine_absolute_pose};
+pub use absolute_pose::{AbsolutePoseEstimate, estimate_absolute_pose, refine_absolute_pose, rival_poses};
 pub use absolute_pose_focal::{AbsolutePoseFocalEstimate, estimate_absolute_pose_focal};
 pub use generalized_pose::{
     GeneralizedPoseEstimate, GeneralizedPoseOptions, GeneralizedSolver, Gravity, SetScale,

@@ -54,6 +54,13 @@ pub struct UnprojectJacobian {
     pub d_params: SMatrix<f64, 3, MAX_CAMERA_PARAMS>,
 }
 
+impl UnprojectJacobian {
+    /// The angle in radians that one pixel spans, the root mean square over the two axes.
+    fn pixel_angle(&self) -> f64 {
+        (self.d_pixel.norm_squared() / 2.0).sqrt()
+    }
+}
+
 impl Camera {
     /// A full panorama of `width` × `height` pixels.
     pub fn equirectangular(width: u32, height: u32) -> Self {
@@ -166,6 +173,14 @@ impl Camera {
         Some(UnprojectJacobian { bearing: undistorted.bearing, d_pixel, d_params })
     }
 
+    /// [`Camera::unproject`] and [`Camera::pixel_angle`] of a pixel in one, which spares inverting the distortion twice.
+    pub fn ray(&self, pixel: &Vector2<f64>) -> Option<(Vector3<f64>, f64)> {
+        if self.is_panoramic() {
+            return self.unproject(pixel).zip(self.pixel_angle(pixel));
+        }
+        self.unproject_with_jacobian(pixel).map(|ray| (ray.bearing, ray.pixel_angle()))
+    }
+
     /// The angle in radians that one pixel spans at this place of the image.
     ///
     /// The root mean square over the two pixel axes, so an isotropic pixel error of σ pixels has the angular
@@ -175,7 +190,7 @@ impl Camera {
         if self.model == CameraModel::Equirectangular {
             return equirectangular::pixel_angle(&self.params, pixel);
         }
-        self.unproject_with_jacobian(pixel).map(|ray| (ray.d_pixel.norm_squared() / 2.0).sqrt())
+        self.unproject_with_jacobian(pixel).map(|ray| ray.pixel_angle())
     }
 
     /// Whether a pixel lies in the image.

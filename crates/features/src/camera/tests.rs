@@ -138,6 +138,9 @@ fn jacobians_agree_with_their_numeric_twins() {
             let pixel = Vector2::new(w * u, h * v);
             let Some(analytic) = camera.unproject_with_jacobian(&pixel) else { continue };
             assert!(angle(&analytic.bearing, &camera.unproject(&pixel).unwrap()) < 1e-13);
+            let (bearing, pixel_angle) = camera.ray(&pixel).unwrap();
+            assert!(angle(&bearing, &analytic.bearing) < 1e-13);
+            assert_eq!(pixel_angle, camera.pixel_angle(&pixel).unwrap());
             check_unproject(&camera, &pixel, &analytic.d_pixel, &analytic.d_params);
 
             let direction = analytic.bearing * 2.5;

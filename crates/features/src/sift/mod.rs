@@ -1,6 +1,6 @@
 //! SIFT: D. G. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
 //!
-//! The image is doubled first, as Lowe advises. OpenCV's `SIFT` is the tests' reference and finds the same points; this
+//! The image is usually doubled first, as Lowe advises. OpenCV's `SIFT` is the tests' reference and finds the same points; this
 //! one needs a third of its time and half of its memory, because differences of Gaussians exist for three rows at a
 //! time only, pyramids are reused instead of being returned to the system, and only points that the caller keeps are
 //! described. It also says whether a point is bright or dark, which OpenCV's does not, and keeps places exact in
@@ -34,6 +34,21 @@ pub(crate) struct SiftParams {
     pub edge_threshold: f64,
     pub octave_layers: usize,
     pub sigma_px: f64,
+    /// Whether the image is doubled first. If not, the finest points are not found, and the work is a quarter.
+    pub doubled: bool,
+}
+
+impl SiftParams {
+    /// Width in image pixels of a pixel of this octave.
+    fn pixel_of(&self, octave: u32) -> f32 {
+        let first = if self.doubled { 0.5 } else { 1.0 };
+        first * (octave as f32).exp2()
+    }
+
+    /// Where the first pixel of every octave has its centre, in image pixels: decimation keeps it.
+    fn first_center(&self) -> f32 {
+        0.5 * self.pixel_of(0)
+    }
 }
 
 /// An image, row-major.
@@ -75,13 +90,10 @@ pub(crate) fn detect_and_describe(
     let mut space = idle_workspaces().pop().unwrap_or_default();
     let points = space.detect(level, params, image, allows);
     let chosen: Vec<SiftPoint> = choose(&points).into_iter().map(|index| points[index]).collect();
-    let descriptors = space.describe(level, &chosen);
+    let descriptors = space.describe(level, params, &chosen);
     idle_workspaces().push(space);
     (chosen, descriptors)
 }
-
-/// Where the first pixel of the doubled image has its centre, in its pixels.
-const FIRST_CENTER: f32 = 0.5;
 
 /// Pyramids not in use. There are never more than images were worked on at the same time.
 ///
@@ -106,7 +118,12 @@ struct Workspace {
 }
 
 impl Workspace {
-    fn describe(&mut self, level: Level, chosen: &[SiftPoint]) -> Vec<[f32; DESCRIPTOR_LEN]> {
+    fn describe(
+        &mut self,
+        level: Level,
+        params: &SiftParams,
+        chosen: &[SiftPoint],
+    ) -> Vec<[f32; DESCRIPTOR_LEN]> {
         // Row by row through each plane, which is far larger than any cache.
         let mut order: Vec<usize> = (0..chosen.len()).collect();
         order.sort_by(|&a, &b| {
@@ -116,12 +133,12 @@ impl Workspace {
         let mut descriptors = vec![[0.0; DESCRIPTOR_LEN]; chosen.len()];
         for at in order {
             let point = &chosen[at];
-            let scale = (point.octave as f32).exp2();
-            let place = |at: f32| (2.0 * at - FIRST_CENTER) / scale;
+            let pixel = params.pixel_of(point.octave);
+            let place = |at: f32| (at - params.first_center()) / pixel;
             let frame = Frame {
                 x: place(point.x),
                 y: place(point.y),
-                sigma: point.size / scale,
+                sigma: 0.5 * point.size / pixel,
                 orientation: point.orientation,
             };
             let plane = &self.octaves[point.octave as usize][point.layer as usize];
@@ -143,7 +160,8 @@ impl Workspace {
         let kernels: Vec<Vec<f32>> = (1..layers + 3)
             .map(|layer| gaussian((sigma(layer).powi(2) - sigma(layer - 1).powi(2)).sqrt()))
             .collect();
-        let first = (params.sigma_px.powi(2) - (2.0 * PHOTO_SIGMA).powi(2)).max(0.01).sqrt();
+        let photo_sigma = if params.doubled { 2.0 * PHOTO_SIGMA } else { PHOTO_SIGMA };
+        let first = (params.sigma_px.powi(2) - photo_sigma.powi(2)).max(0.01).sqrt();
         self.scratch.resize_with(3, Plane::default);
         let mut points = Vec::new();
         let mut extrema = Vec::new();
@@ -159,7 +177,11 @@ impl Workspace {
             };
             match done.last() {
                 None => {
-                    beyond_1.set_doubled(image.width, image.height, image.values);
+                    if params.doubled {
+                        beyond_1.set_doubled(image.width, image.height, image.values);
+                    } else {
+                        beyond_1.set(image.width, image.height, image.values);
+                    }
                     blur(level, &gaussian(first), beyond_1, base);
                 }
                 Some(finer) => base.set_halved(&finer[layers]),
@@ -178,10 +200,9 @@ impl Workspace {
                 std::iter::once(&*base).chain(&current[1..]).chain([&*beyond_1, &*beyond_2]).collect();
             extrema.clear();
             find_extrema(level, params, &planes, &mut self.scan_rows, &mut extrema);
-            let pixels = 0.5 * (octave as f32).exp2();
+            let pixel = params.pixel_of(octave as u32);
             for extremum in &extrema {
-                // Decimation keeps the centre of the first pixel where it is in the doubled image.
-                let place = |at: f32| at * pixels + 0.5 * FIRST_CENTER;
+                let place = |at: f32| at * pixel + params.first_center();
                 let (x, y) = (place(extremum.x), place(extremum.y));
                 if !allows(x, y) {
                     continue;
@@ -191,7 +212,7 @@ impl Workspace {
                     points.push(SiftPoint {
                         x,
                         y,
-                        size: 2.0 * extremum.sigma * pixels,
+                        size: 2.0 * extremum.sigma * pixel,
                         orientation,
                         response: extremum.contrast.abs(),
                         is_light: extremum.contrast < 0.0,

@@ -27,6 +27,14 @@ impl Plane {
         self.values[y * self.width + x]
     }
 
+    /// The grey values as they are.
+    pub fn set(&mut self, width: usize, height: usize, grey: &[u8]) {
+        self.resize(width, height);
+        for (value, &grey) in self.values.iter_mut().zip(grey) {
+            *value = f32::from(grey);
+        }
+    }
+
     /// Twice the size by linear interpolation: pixel `x` comes to lie at 2x + ½.
     pub fn set_doubled(&mut self, width: usize, height: usize, grey: &[u8]) {
         self.resize(width * 2, height * 2);

@@ -6,8 +6,13 @@ use rand_chacha::ChaCha8Rng;
 
 use super::*;
 
-const PARAMS: SiftParams =
-    SiftParams { contrast_threshold: 0.04, edge_threshold: 10.0, octave_layers: 3, sigma_px: 1.6 };
+const PARAMS: SiftParams = SiftParams {
+    contrast_threshold: 0.04,
+    edge_threshold: 10.0,
+    octave_layers: 3,
+    sigma_px: 1.6,
+    doubled: true,
+};
 
 /// Bright and dark Gaussian spots of all sizes on grey.
 fn spots(seed: u64, width: usize, height: usize) -> Vec<u8> {
@@ -30,8 +35,17 @@ fn spots(seed: u64, width: usize, height: usize) -> Vec<u8> {
 }
 
 fn all(width: usize, height: usize, values: &[u8]) -> (Vec<SiftPoint>, Vec<[f32; DESCRIPTOR_LEN]>) {
+    all_by(&PARAMS, width, height, values)
+}
+
+fn all_by(
+    params: &SiftParams,
+    width: usize,
+    height: usize,
+    values: &[u8],
+) -> (Vec<SiftPoint>, Vec<[f32; DESCRIPTOR_LEN]>) {
     let choose = |points: &[SiftPoint]| (0..points.len()).collect();
-    detect_and_describe(&PARAMS, Grey { width, height, values }, |_, _| true, choose)
+    detect_and_describe(params, Grey { width, height, values }, |_, _| true, choose)
 }
 
 fn opencv(width: usize, height: usize, values: &[u8]) -> (Vec<KeyPoint>, Mat) {
@@ -73,6 +87,32 @@ fn finds_and_describes_the_points_that_opencv_does() {
     }
     assert!(twins * 100 > points.len() * 96, "{twins} of {}", points.len());
     assert!(similar * 100 > twins * 95, "{similar} of {twins}");
+}
+
+#[test]
+fn coarse_points_need_no_doubling() {
+    let (width, height) = (512, 384);
+    let image = spots(4, width, height);
+    let (doubled, doubled_descriptors) = all(width, height, &image);
+    let (points, descriptors) = all_by(&SiftParams { doubled: false, ..PARAMS }, width, height, &image);
+    let (mut coarse, mut twins, mut similar) = (0, 0, 0);
+    for (point, descriptor) in points.iter().zip(&descriptors).filter(|(point, _)| point.size > 8.0) {
+        coarse += 1;
+        let twin = doubled.iter().position(|other| {
+            (other.x - point.x).hypot(other.y - point.y) < 0.3
+                && (other.size / point.size).ln().abs() < 0.1
+                && (other.orientation - point.orientation).abs() < 0.1
+        });
+        if let Some(twin) = twin {
+            twins += 1;
+            similar += usize::from(cosine(descriptor, &doubled_descriptors[twin]) > 0.98);
+        }
+    }
+    assert!(
+        coarse > 200 && twins * 10 > coarse * 8 && similar * 10 > twins * 9,
+        "{coarse} {twins} {similar}"
+    );
+    assert!(points.iter().all(|point| point.size > 2.0 * 1.6));
 }
 
 #[test]
@@ -127,7 +167,7 @@ fn all_levels_give_the_same_bits() {
         let mut space = Workspace::default();
         let view = Grey { width, height, values: &image };
         let points = space.detect(level, &PARAMS, view, |_, _| true);
-        let descriptors = space.describe(level, &points);
+        let descriptors = space.describe(level, &PARAMS, &points);
         (format!("{points:?}"), descriptors)
     };
     assert_eq!(run(Level::Baseline), run(Level::detect()));

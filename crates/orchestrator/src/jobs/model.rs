@@ -221,7 +221,9 @@ fn add_pair(
     let verify_work = move |inputs: &Inputs<'_, '_>| {
         let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
         let matches = inputs.get::<PairMatches>("matches")?;
-        let (first, second) = (first.rays(&cameras[0]), second.rays(&cameras[1]));
+        // Far fewer are matched than found, and a ray takes longer than what verification does with it.
+        let first = first.rays_of(&cameras[0], matches.0.iter().map(|m| m.first));
+        let second = second.rays_of(&cameras[1], matches.0.iter().map(|m| m.second));
         Product::new(VerifiedPair(verify_pair(&two_view, &first, &second, &matches.0, seed)))
     };
     let verified = graph.add(Job {

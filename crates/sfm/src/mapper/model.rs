@@ -35,7 +35,7 @@ pub(super) struct ModelPoint {
 }
 
 /// The model under construction: one component.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Model<'a> {
     pub input: &'a MapperInput<'a>,
     pub cameras: Vec<Camera>,

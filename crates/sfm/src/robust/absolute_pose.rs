@@ -1,4 +1,5 @@
 use nalgebra::{Matrix3, Rotation3, SVector, UnitQuaternion, Vector3};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
@@ -56,6 +57,71 @@ pub fn refine_absolute_pose(
         None => *initial,
     }
 }
+
+/// Poses that differ from `current` by more than a small rotation and explain nearly as many of the same points.
+///
+/// Points on one far plane that fill a small angle allow two poses: the camera may stand on the one side of the plane's
+/// normal or on the other (G. Schweighofer, A. Pinz, "Robust pose estimation from a planar target", PAMI 2006). Each is
+/// a minimum of its own, which [`refine_absolute_pose`] does not leave. Sought by P3P from random samples and refined;
+/// at most four, no two alike, the best first.
+pub fn rival_poses(
+    params: &RansacParams,
+    bearings_in_camera: &[Vector3<f64>],
+    sigmas: &[f64],
+    points_in_world: &[Vector3<f64>],
+    current: &Rigid,
+    seed: u64,
+) -> Vec<Rigid> {
+    let Some(mut problem) = AbsoluteConsensus::new(params, bearings_in_camera, sigmas, points_in_world)
+        .filter(|problem| problem.len() >= params.min_inliers.max(problem.sample_size()))
+    else {
+        return Vec::new();
+    };
+    let bound = params.max_error_sigma * params.max_error_sigma;
+    let inliers = |problem: &AbsoluteConsensus<'_>, model: &CameraFromWorld| -> Vec<u32> {
+        let indices = (0..problem.len()).filter(|&at| problem.squared_residual(model, at, bound) <= bound);
+        indices.map(|at| at as u32).collect()
+    };
+    let enough = RIVAL_SHARE * inliers(&problem, &CameraFromWorld::new(current)).len() as f64;
+    let differ = |a: &Rigid, b: &Rigid| a.rotation.angle_to(&b.rotation) > RIVAL_ROTATION_RAD;
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut models = Vec::new();
+    let mut rivals: Vec<(f64, Rigid)> = Vec::new();
+    for _ in 0..RIVAL_SAMPLES {
+        models.clear();
+        problem.hypothesize(&mut rng, &mut models);
+        for model in &models {
+            let agreeing = inliers(&problem, model);
+            if (agreeing.len() as f64) < enough || !differ(&model.world_from_camera(), current) {
+                continue;
+            }
+            let refined = problem.refine(model, &agreeing, 30);
+            let pose = refined.world_from_camera();
+            if (inliers(&problem, &refined).len() as f64) < enough || !differ(&pose, current) {
+                continue;
+            }
+            let residuals = (0..problem.len()).map(|at| problem.squared_residual(&refined, at, bound));
+            rivals.push((residuals.map(|squared| squared.min(bound)).sum(), pose));
+        }
+    }
+    rivals.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut distinct: Vec<Rigid> = Vec::new();
+    for (_, pose) in rivals {
+        if distinct.len() < MAX_RIVALS && distinct.iter().all(|other| differ(&pose, other)) {
+            distinct.push(pose);
+        }
+    }
+    distinct
+}
+
+/// Most rivals of a pose.
+const MAX_RIVALS: usize = 4;
+/// Samples of three points from which rivals are sought.
+const RIVAL_SAMPLES: usize = 64;
+/// Least rotation of a rival against the pose and other rivals.
+const RIVAL_ROTATION_RAD: f64 = 0.05;
+/// Least inliers of a rival, of those of the pose.
+const RIVAL_SHARE: f64 = 0.6;
 
 /// y = R·X + t with the rotation as a matrix.
 #[derive(Debug, Clone, Copy)]
@@ -193,7 +259,8 @@ pub(super) fn turned(rotation: &Matrix3<f64>, delta: &Vector3<f64>) -> Matrix3<f
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::synthetic::{AbsoluteProblem, rotation_angle, seeded};
+    use crate::synthetic::{AbsoluteProblem, normal, perturb, rotation_angle, seeded};
+    use rand::Rng;
 
     #[test]
     fn finds_every_pose_among_outliers() {
@@ -231,6 +298,60 @@ mod tests {
             let found =
                 estimate_absolute_pose(&params, &problem.bearings, &[1e-3; 60], &problem.points, seed);
             assert!(found.is_none());
+        }
+    }
+
+    /// A wall 12 m off of which a strip of 3 × 3 m is seen, from a place to the right of its normal.
+    fn wall(rng: &mut ChaCha8Rng) -> (Rigid, Vec<Vector3<f64>>) {
+        let points = (0..60).map(|_| {
+            let [x, y] = [0, 1].map(|_| rng.random_range(-1.5..1.5));
+            Vector3::new(x, y, 12.0 + 0.02 * normal(rng))
+        });
+        let points = points.collect();
+        let turned = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), -0.2);
+        (Rigid::new(turned, Vector3::new(2.4, 0.1, 0.3)), points)
+    }
+
+    #[test]
+    fn a_far_wall_allows_a_second_pose() {
+        let mut rng = seeded("far wall");
+        let sigma = 1e-3;
+        let mut mistaken = 0;
+        for seed in 0..20 {
+            let (truth, points) = wall(&mut rng);
+            let bearings: Vec<Vector3<f64>> = points
+                .iter()
+                .map(|point| perturb(&mut rng, &truth.inverse_transform_point(point).normalize(), sigma))
+                .collect();
+            let params = RansacParams { min_inliers: 8, ..RansacParams::default() };
+            let rivals =
+                |pose: &Rigid| rival_poses(&params, &bearings, &[3.0 * sigma; 60], &points, pose, seed);
+            let off = |pose: &Rigid| rotation_angle(&pose.rotation, &truth.rotation);
+            // From the mistaken pose the true one is found.
+            for mistake in rivals(&truth).iter().filter(|rival| off(rival) > 0.2) {
+                mistaken += 1;
+                let nearest = rivals(mistake).iter().map(off).fold(f64::INFINITY, f64::min);
+                assert!(nearest < 0.1, "seed {seed}: {nearest}");
+            }
+        }
+        assert!(mistaken > 5, "{mistaken}");
+    }
+
+    #[test]
+    fn points_all_around_allow_one_pose_only() {
+        let mut rng = seeded("no rivals");
+        for seed in 0..20 {
+            let problem = AbsoluteProblem::exact(&mut rng, 60);
+            let params = RansacParams { min_inliers: 8, ..RansacParams::default() };
+            let rivals = rival_poses(
+                &params,
+                &problem.bearings,
+                &[3e-3; 60],
+                &problem.points,
+                &problem.world_from_camera,
+                seed,
+            );
+            assert!(rivals.is_empty(), "seed {seed}: {rivals:?}");
         }
     }
 
