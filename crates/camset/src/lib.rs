@@ -40,4 +40,4 @@ pub use types::{
 /// places of their pixels. 6: covariances that the points bear out. 7: models mapped and aligned on all cores. 8: each
 /// covariance is asked of its own pose's points. 9: sets take over what is known of their photos alone. 10: lengths that
 /// planes tell hold the set's baselines. 11: matches far astray are no noise.
-pub const VERSION: u32 = 12;
+pub const VERSION: u32 = 13;

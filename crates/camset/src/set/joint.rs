@@ -670,12 +670,18 @@ impl Component<'_> {
         agreements.reduce(|a, b| a && b)
     }
 
-    /// Median distance from a photo to the scene points that it sees, else to its local points.
+    /// Median distance from a photo to the scene points that it sees, else to those that other photos from its standpoint
+    /// see, else to its local points: where nothing but the standpoint is placed, these have no scale.
     fn depth(&self, joint: &Joint, slot: usize) -> f64 {
-        let center = joint.model.photos[slot].world_from_camera.translation;
-        let to_scene =
-            joint.direct[slot].iter().map(|m| (self.scene.index.position(m.point) - center).norm()).collect();
-        median(to_scene)
+        let photos = &joint.model.photos;
+        let center = photos[slot].world_from_camera.translation;
+        let to_scene = |slots: &mut dyn Iterator<Item = usize>| {
+            let seen = slots.flat_map(|slot| &joint.direct[slot]);
+            median(seen.map(|m| (self.scene.index.position(m.point) - center).norm()).collect())
+        };
+        let beside = |other: &usize| photos[*other].standpoint == photos[slot].standpoint;
+        to_scene(&mut std::iter::once(slot))
+            .or_else(|| to_scene(&mut (0..photos.len()).filter(beside)))
             .or_else(|| {
                 let sees = |local: &usize| self.track(*local).iter().any(|&(seer, _)| seer == slot);
                 let local = (0..self.model.points.len()).filter(sees);
