@@ -10,6 +10,8 @@ mod merge;
 mod model;
 mod plane;
 mod register;
+mod repeated;
+mod sides;
 mod standpoint;
 mod structure;
 
@@ -47,7 +49,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 10;
+pub const MAPPER_VERSION: u32 = 11;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -257,9 +259,18 @@ pub struct MapperOutput {
 /// Images that share no geometry with others are in no component. The frame of a component is its first camera's,
 /// with the first baseline as unit of length, until it is georegistered.
 pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
-    match Standpoints::find(params, input, seed) {
-        Some(standpoints) => standpoints.expand(reconstruct_images(params, &standpoints.input(), seed)),
-        None => reconstruct_images(params, input, seed),
+    if let Some(standpoints) = Standpoints::find(params, input, seed) {
+        return standpoints.expand(reconstruct_images(params, &standpoints.input(), seed));
+    }
+    let output = reconstruct_images(params, input, seed);
+    match repeated::without_repeated_side(input, seed) {
+        Some(rest) if rest.contradicts(&output.components) => {
+            let input = MapperInput { pairs: &rest.pairs, putative: &rest.putative, ..input.clone() };
+            let mut output = reconstruct_images(params, &input, seed);
+            output.report.warnings.push(repeated::WARNING.to_owned());
+            output
+        }
+        _ => output,
     }
 }
 

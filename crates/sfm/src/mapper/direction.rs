@@ -17,6 +17,18 @@ pub(super) fn cell(direction: &Vector3<f64>) -> Option<usize> {
     Some((face * SIDE + along(direction[(axis + 1) % 3])) * SIDE + along(direction[(axis + 2) % 3]))
 }
 
+/// The unit vector through the middle of a cell.
+pub(super) fn centre(cell: usize) -> Vector3<f64> {
+    let (face, row, column) = (cell / (SIDE * SIDE), cell / SIDE % SIDE, cell % SIDE);
+    let axis = face / 2;
+    let along = |step: usize| (step as f64 + 0.5) / SIDE as f64 * 2.0 - 1.0;
+    let mut direction = Vector3::zeros();
+    direction[axis] = if face.is_multiple_of(2) { 1.0 } else { -1.0 };
+    direction[(axis + 1) % 3] = along(row);
+    direction[(axis + 2) % 3] = along(column);
+    direction.normalize()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -32,5 +44,10 @@ mod tests {
         assert_eq!(cells.len(), 6);
         assert!(cells.iter().all(|&cell| cell < CELLS));
         assert_eq!(cell(&Vector3::zeros()), None);
+    }
+
+    #[test]
+    fn the_centre_of_a_cell_lies_in_it() {
+        assert!((0..CELLS).all(|at| cell(&centre(at)) == Some(at)));
     }
 }

@@ -1,0 +1,162 @@
+//! The mapper in a room whose floor repeats itself exactly.
+
+use nalgebra::{UnitQuaternion, Vector3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use setloc_features::{Camera, ImageFeatures, Keypoint, Match};
+use setloc_sfm::{
+    CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, PairGeometry, PutativePair,
+    Rigid, Similarity, TwoViewParams, reconstruct, verify_pair,
+};
+
+const TILE_M: f64 = 0.8;
+const SPOTS: usize = 16;
+const WALL_POINTS: usize = 240;
+
+/// What a keypoint shows.
+#[derive(Clone, Copy, PartialEq)]
+enum Seen {
+    Wall(usize),
+    Floor { tile: [i32; 2], spot: usize },
+}
+
+struct Room {
+    truth: Vec<Rigid>,
+    camera: Camera,
+    features: Vec<ImageFeatures>,
+    seen: Vec<Vec<Seen>>,
+}
+
+impl Room {
+    /// Seven panoramas 1 m apart along a room of 9 m × 5 m, 1.5 m above a tiled floor.
+    fn new() -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let mut points: Vec<(Seen, Vector3<f64>)> = (0..WALL_POINTS)
+            .map(|at| {
+                let (along, height) = (rng.random_range(-1.5..7.5), rng.random_range(-1.0..-0.1));
+                let side = if rng.random_bool(0.5) { 2.5 } else { -2.5 };
+                (Seen::Wall(at), Vector3::new(side, height, along))
+            })
+            .collect();
+        let spots: Vec<[f64; 2]> = (0..SPOTS).map(|_| [rng.random(), rng.random()]).collect();
+        for (x, z) in (-4..4).flat_map(|x| (-3..11).map(move |z| (x, z))) {
+            for (spot, at) in spots.iter().enumerate() {
+                let [x_m, z_m] = [f64::from(x) + at[0], f64::from(z) + at[1]].map(|tiles| tiles * TILE_M);
+                points.push((Seen::Floor { tile: [x, z], spot }, Vector3::new(x_m, 1.5, z_m)));
+            }
+        }
+        let camera = Camera::equirectangular(2048, 1024);
+        let mut room = Self { truth: vec![], camera, features: vec![], seen: vec![] };
+        for k in 0..7 {
+            let center =
+                Vector3::new(rng.random_range(-0.4..0.4), rng.random_range(-0.05..0.05), f64::from(k));
+            let pose =
+                Rigid::new(UnitQuaternion::from_euler_angles(0.0, rng.random_range(-3.1..3.1), 0.0), center);
+            let mut features = ImageFeatures { width: 2048, height: 1024, ..ImageFeatures::default() };
+            let mut seen = Vec::new();
+            for (what, point) in &points {
+                let is_near = matches!(what, Seen::Wall(_)) || (point - center).norm() < 2.4;
+                let pixel = room.camera.project(&pose.inverse_transform_point(point));
+                let Some(pixel) = pixel.filter(|_| is_near) else { continue };
+                let [x, y] = [pixel.x, pixel.y].map(|at| (at + rng.random_range(-0.5..0.5)) as f32);
+                features.keypoints.push(Keypoint { x, y, size: 5.0, orientation: 0.0, noise_px: 0.5 });
+                features.colors.push([128; 3]);
+                seen.push(*what);
+            }
+            room.truth.push(pose);
+            room.features.push(features);
+            room.seen.push(seen);
+        }
+        room
+    }
+
+    /// Few points of the walls match, and most of the floor: as if both stood over the same tile, if tiles are alike.
+    fn matches(&self, a: usize, b: usize, are_tiles_alike: bool, rng: &mut ChaCha8Rng) -> Vec<Match> {
+        let apart = (self.truth[b].translation - self.truth[a].translation) / TILE_M;
+        let shift = if are_tiles_alike { [apart.x.round() as i32, apart.z.round() as i32] } else { [0, 0] };
+        let mut found = Vec::new();
+        for (first, seen) in self.seen[a].iter().enumerate() {
+            let (wanted, share) = match *seen {
+                Seen::Wall(at) => (Seen::Wall(at), 0.3),
+                Seen::Floor { tile, spot } => {
+                    (Seen::Floor { tile: [tile[0] + shift[0], tile[1] + shift[1]], spot }, 0.7)
+                }
+            };
+            if let Some(second) = self.seen[b].iter().position(|other| *other == wanted)
+                && rng.random_bool(share)
+            {
+                found.push(Match { first: first as u32, second: second as u32 });
+            }
+        }
+        found
+    }
+
+    fn map(&self, are_tiles_alike: bool) -> MapperOutput {
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let rays: Vec<_> = self.features.iter().map(|features| features.rays(&self.camera)).collect();
+        let names: Vec<String> = (0..rays.len()).map(|at| format!("image_{at}")).collect();
+        let (mut pairs, mut putative) = (Vec::new(), Vec::new());
+        for (a, b) in (0..rays.len()).flat_map(|a| (a + 1..rays.len()).map(move |b| (a, b))) {
+            let (first, second) = (ImageId(a as u32), ImageId(b as u32));
+            let matches = self.matches(a, b, are_tiles_alike, &mut rng);
+            let views = verify_pair(&TwoViewParams::default(), &rays[a], &rays[b], &matches, 7);
+            pairs.extend(views.into_iter().map(|two_view| PairGeometry { first, second, two_view }));
+            putative.push(PutativePair { first, second, matches });
+        }
+        let images = (self.features.iter().zip(&names)).map(|(features, name)| InputImage {
+            name,
+            camera: CameraId(0),
+            features,
+            position_prior: None,
+            mosaic: None,
+        });
+        let input = MapperInput {
+            cameras: vec![self.camera.clone()],
+            camera_fixed: vec![true],
+            images: images.collect(),
+            pairs: &pairs,
+            putative: &putative,
+            two_view: TwoViewParams::default(),
+        };
+        reconstruct(&MapperParams::default(), &input, 5)
+    }
+
+    /// Asserts that all images are registered, and returns the largest error of a centre in metres.
+    fn error_m(&self, output: &MapperOutput) -> f64 {
+        let component = &output.components[0];
+        let poses: Vec<Rigid> = component.images.iter().filter_map(|image| image.world_from_camera).collect();
+        assert_eq!(poses.len(), self.truth.len());
+        let centers = |poses: &[Rigid]| poses.iter().map(|pose| pose.translation).collect::<Vec<_>>();
+        let (found, truth) = (centers(&poses), centers(&self.truth));
+        let truth_from_world =
+            Similarity::from_point_pairs(&found, &truth).expect("centres are not collinear");
+        let error = |(at, truth): (&Vector3<f64>, &Vector3<f64>)| {
+            (truth_from_world.transform_point(at) - truth).norm()
+        };
+        found.iter().zip(&truth).map(error).fold(0.0, f64::max)
+    }
+}
+
+fn says_so(output: &MapperOutput) -> bool {
+    output.report.warnings.iter().any(|line| line.contains("one side"))
+}
+
+#[test]
+fn a_floor_of_equal_tiles_does_not_fold_the_room() {
+    let room = Room::new();
+    let output = room.map(true);
+    assert!(says_so(&output));
+    let error = room.error_m(&output);
+    assert!(error < 0.03, "{error} m");
+}
+
+#[test]
+fn a_floor_without_repetition_is_used() {
+    let room = Room::new();
+    let output = room.map(false);
+    assert!(!says_so(&output));
+    let error = room.error_m(&output);
+    assert!(error < 0.02, "{error} m");
+    let below = output.components[0].points.iter().filter(|point| point.track.len() > 2).count();
+    assert!(below > 500, "{below} points");
+}
