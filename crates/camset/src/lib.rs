@@ -39,5 +39,6 @@ pub use types::{
 /// points hold still, standpoints move together, no pose without scale. 4: noise as the residuals show it. 5: sets by the
 /// places of their pixels. 6: covariances that the points bear out. 7: models mapped and aligned on all cores. 8: each
 /// covariance is asked of its own pose's points. 9: sets take over what is known of their photos alone. 10: lengths that
-/// planes tell hold the set's baselines. 11: matches far astray are no noise.
-pub const VERSION: u32 = 13;
+/// planes tell hold the set's baselines. 11: matches far astray are no noise. 13: photos of one standpoint are judged by
+/// what any of them sees. 14: photos stand where their pair by planes has them, as well as that tells.
+pub const VERSION: u32 = 14;

@@ -160,7 +160,7 @@ fn or_alone(
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
+    use nalgebra::{UnitQuaternion, Vector3};
 
     use super::*;
     use crate::jackknife::deviation;
@@ -251,6 +251,27 @@ mod tests {
             let link = found.paths[6].links.last().expect("hangs on the photo before");
             assert!(link.shared >= 12, "{link:?}");
         }
+    }
+
+    #[test]
+    fn a_target_stands_where_its_pair_by_a_wall_has_it_as_well_as_that_tells() {
+        let mut world = World::chain(7, 0.2, 45);
+        world.cut_last(0.0, 0.02);
+        let turn = UnitQuaternion::from_euler_angles(0.0, 0.01, 0.0);
+        let length = &mut world.local.lengths[0];
+        length.pose.rotation *= turn;
+        for axis in 0..3 {
+            length.covariance[(axis, axis)] = 0.012_f64.powi(2);
+        }
+        let found = locate(&world, &CamsetParams::default());
+        let [near, target] = [5, 6].map(|photo| &found.refined[photo]);
+        assert_eq!((near.verdict, target.verdict), (Verdict::Localized, Verdict::Uncertain));
+        let pose = target.world_from_camera.expect("has a pose");
+        let turned = world.photos[6].pose.rotation * turn;
+        assert!(pose.rotation.angle_to(&turned) < 0.002, "{}", pose.rotation.angle_to(&turned));
+        let covariance = target.covariance.expect("is stated");
+        let rotation = covariance.fixed_view::<3, 3>(0, 0).trace() / 3.0;
+        assert!((1.0..1.3).contains(&(rotation / 0.012_f64.powi(2))), "{rotation}");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! A street with truth: panoramas at its beginning, a chain of photos that leads away from them.
 
-use nalgebra::{Matrix3, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
@@ -241,6 +241,15 @@ impl World {
         });
         let center = |image: u32| self.local.images[image as usize].world_from_camera.unwrap().translation;
         let [a, b, c] = [last - 2, last - 1, last].map(center);
+        let [from, to] =
+            [last - 1, last].map(|image| self.local.images[image as usize].world_from_camera.unwrap());
+        let exact = from.inverse() * to;
+        let mut pose = exact;
+        pose.translation *= error.exp() / (b - a).norm();
+        let along = pose.translation * deviation;
+        let mut covariance = Matrix6::identity() * 1e-6;
+        let mut of_center = covariance.fixed_view_mut::<3, 3>(3, 3);
+        of_center += along * along.transpose();
         self.local.lengths.push(BaselineLength {
             reference: ImageId(last - 2),
             from: ImageId(last - 1),
@@ -248,6 +257,8 @@ impl World {
             ratio: (c - b).norm() / (b - a).norm() * error.exp(),
             deviation,
             votes: 20,
+            pose,
+            covariance,
         });
     }
 

@@ -32,7 +32,7 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 6);
+serde_artifact!(SceneFile, "scene", 7);
 
 impl SceneFile {
     /// Reads a scene file.

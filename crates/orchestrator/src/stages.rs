@@ -25,8 +25,9 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// Version of the scene file's making.
 ///
 /// 2: holds the hash of what localization depends on, and only the configuration that the scene depends on.
-/// 4: notes. 6: models state lengths that their points do not tell.
-pub const SCENE_VERSION: u32 = 6;
+/// 4: notes. 6: models state lengths that their points do not tell. 7: and the poses at
+/// their ends.
+pub const SCENE_VERSION: u32 = 7;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
 /// Version of set localization.

@@ -3,17 +3,20 @@
 mod adjust;
 mod ambiguity;
 mod continuation;
+mod corner;
 mod correspondence;
 mod direction;
 mod initial;
 mod merge;
 mod model;
+mod nearby;
 mod plane;
 mod register;
 mod repeated;
 mod sides;
 mod standpoint;
 mod structure;
+mod wall;
 
 use std::collections::BTreeMap;
 
@@ -49,7 +52,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 11;
+pub const MAPPER_VERSION: u32 = 12;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,4 +1,4 @@
-use nalgebra::{Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, Keypoint};
 
@@ -101,6 +101,10 @@ pub struct BaselineLength {
     pub deviation: f64,
     /// Points that agree on it.
     pub votes: usize,
+    /// Pose of `to` in the frame of `from`, in lengths of the reference baseline.
+    pub pose: Rigid,
+    /// Its covariance: rotation about the axes of `to`, then the centre.
+    pub covariance: Matrix6<f64>,
 }
 
 impl BaselineLength {
@@ -123,6 +127,17 @@ impl BaselineLength {
     pub fn between(self, image: impl Fn(ImageId) -> ImageId) -> Self {
         let [reference, from, to] = [self.reference, self.from, self.to].map(image);
         Self { reference, from, to, ..self }
+    }
+
+    /// The same in other frames of the two cameras, given their turns into the present ones.
+    #[must_use]
+    pub fn turned(self, from: &UnitQuaternion<f64>, to: &UnitQuaternion<f64>) -> Self {
+        let rotation = from.inverse() * self.pose.rotation * to;
+        let mut jacobian = Matrix6::zeros();
+        jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(to.inverse().to_rotation_matrix().matrix());
+        jacobian.fixed_view_mut::<3, 3>(3, 3).copy_from(from.inverse().to_rotation_matrix().matrix());
+        let pose = Rigid::new(rotation, from.inverse() * self.pose.translation);
+        Self { pose, covariance: jacobian * self.covariance * jacobian.transpose(), ..self }
     }
 }
 
@@ -245,6 +260,8 @@ mod tests {
                 ratio: 1.5,
                 deviation: 0.1,
                 votes: 20,
+                pose: Rigid::identity(),
+                covariance: Matrix6::identity(),
             }],
         };
         let listed = model.by_name();

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{Matrix3, Matrix6, Vector3};
+use nalgebra::{Matrix3, Matrix6};
 use rayon::prelude::*;
 use setloc_features::{Camera, Keypoint};
 use setloc_sfm::{BaselineLength, ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
@@ -97,28 +97,100 @@ fn refuse_without_scale(photo: &mut PhotoLocalization) {
     photo.reasons.push("how far it is from the photo that sees the scene is not known".to_owned());
 }
 
-/// Standard deviations of the direction of a baseline and of the rotation across it where planes tell its length.
-///
-/// Such a pair sees hardly more than one far wall, and a wall alone fits many directions. On five rendered corners the
-/// directions were off by 0.03–4.0° and the rotations by 0.03–0.8°, up to forty times what the residuals state.
-const PAIR_DIRECTION_RAD: f64 = 0.045;
-const PAIR_ROTATION_RAD: f64 = 0.009;
 /// Local points that tie two photos.
 const MIN_TIE: usize = 8;
 
 /// Observations that a photo's six degrees of freedom can fit whatever they are.
 const POSE_OBSERVATIONS: usize = 3;
 
+/// A pair of photos whose length planes tell.
+struct Hung {
+    /// The reference, the nearer photo and the farther one.
+    slots: [usize; 3],
+    length: BaselineLength,
+    /// The photos that hang on the pair.
+    beyond: Vec<bool>,
+}
+
+impl Hung {
+    /// Moves the photos beyond the pair as one, so that the farther one stands where the pair has it.
+    fn follow(&self, poses: &mut [Rigid]) {
+        let [reference, from, to] = self.slots;
+        if !self.beyond[to] {
+            return;
+        }
+        let baseline = (poses[from].translation - poses[reference].translation).norm();
+        let Rigid { rotation, translation } = self.length.pose;
+        let moved = poses[from] * Rigid::new(rotation, translation * baseline) * poses[to].inverse();
+        for (pose, _) in poses.iter_mut().zip(&self.beyond).filter(|(_, beyond)| **beyond) {
+            *pose = moved * *pose;
+        }
+    }
+
+    /// States the covariances of those photos: what the pair leaves open beside what the nearer photo does.
+    fn state(&self, poses: &[Rigid], covariances: &mut [Option<Matrix6<f64>>]) {
+        let [reference, from, to] = self.slots;
+        if !self.beyond[to] {
+            return;
+        }
+        let (near, far) = (&poses[from], &poses[to]);
+        let baseline = near.translation - poses[reference].translation;
+        let of_far = match (covariances[reference], covariances[from]) {
+            (Some(of_reference), Some(of_near)) => {
+                let step = far.translation - near.translation;
+                let mut carried = Matrix6::identity();
+                let turn = |pose: &Rigid| pose.rotation.to_rotation_matrix().into_inner();
+                carried.fixed_view_mut::<3, 3>(0, 0).copy_from(&(turn(far).transpose() * turn(near)));
+                carried.fixed_view_mut::<3, 3>(3, 0).copy_from(&-(step.cross_matrix() * turn(near)));
+                let mut own = Matrix6::identity();
+                own.fixed_view_mut::<3, 3>(3, 3).copy_from(&(turn(near) * baseline.norm()));
+                let along = baseline.normalize();
+                let center = |covariance: &Matrix6<f64>| covariance.fixed_view::<3, 3>(3, 3).into_owned();
+                let of_baseline = along.dot(&((center(&of_reference) + center(&of_near)) * along));
+                let mut sum =
+                    carried * of_near * carried.transpose() + own * self.length.covariance * own.transpose();
+                let mut of_center = sum.fixed_view_mut::<3, 3>(3, 3);
+                of_center += step * step.transpose() * (of_baseline / baseline.norm_squared());
+                Some(sum)
+            }
+            _ => None,
+        };
+        for (slot, covariance) in covariances.iter_mut().enumerate().filter(|(slot, _)| self.beyond[*slot]) {
+            let Some(of_far) = of_far else {
+                *covariance = None;
+                continue;
+            };
+            let pose = &poses[slot];
+            let lever = pose.translation - far.translation;
+            let world_from_far = far.rotation.to_rotation_matrix().into_inner();
+            let mut carried = Matrix6::identity();
+            let turned = pose.rotation.inverse().to_rotation_matrix().into_inner() * world_from_far;
+            carried.fixed_view_mut::<3, 3>(0, 0).copy_from(&turned);
+            carried.fixed_view_mut::<3, 3>(3, 0).copy_from(&-(lever.cross_matrix() * world_from_far));
+            let by_pair = carried * of_far * carried.transpose();
+            // What lies between photos beyond the pair is in the adjustment's.
+            *covariance = match (lever.norm() > 0.0, *covariance) {
+                (true, Some(own)) => Some(own + by_pair),
+                (true, None) => None,
+                (false, _) => Some(by_pair),
+            };
+        }
+    }
+}
+
 impl Component<'_> {
     /// Localizes the component.
     pub(crate) fn locate(&self, seed: u64) -> ComponentAnswer {
         let params = self.params;
         let rays = self.rays(&self.model.cameras);
-        let set_from_camera: Vec<Rigid> = self
+        let mut set_from_camera: Vec<Rigid> = self
             .members
             .iter()
             .map(|&photo| self.model.images[photo].world_from_camera.unwrap_or_default())
             .collect();
+        for hung in self.hung(&set_from_camera) {
+            hung.follow(&mut set_from_camera);
+        }
         let candidates =
             correspondences(params, self.scene.index, self.model, self.members, &rays, self.evidence);
         let mut scene_points = vec![0; self.members.len()];
@@ -141,7 +213,7 @@ impl Component<'_> {
             return ComponentAnswer::Refused { reasons, scene_points };
         }
         let mut joint = self.refine_jointly(&set_from_camera, &candidates, &rigid);
-        self.widen_by_pairs(&mut joint);
+        self.follow_pairs(&mut joint);
         evidence.log10_false_alarms = evidence.log10_false_alarms.min(self.joint_false_alarms(&joint));
         let mut support = judge_support(&params.verdict, &evidence, &mut reasons);
         let elsewhere = seen_from_elsewhere(&set_from_camera, &candidates, &rigid.agreeing);
@@ -198,54 +270,57 @@ impl Component<'_> {
         })
     }
 
-    /// Widens the covariances of the photos that hang on a pair whose length planes tell by what the pair leaves open.
-    fn widen_by_pairs(&self, joint: &mut Joint) {
-        for ([reference, from, to], _) in self.lengths() {
-            let centers: Vec<Vector3<f64>> =
-                joint.model.photos.iter().map(|photo| photo.world_from_camera.translation).collect();
-            let step = centers[to] - centers[from];
-            let Some(along) = step.try_normalize(0.0) else { continue };
-            let across = Matrix3::identity() - along * along.transpose();
-            let hanging = self.beyond(&joint.model.photos, [reference, from, to]);
-            for (slot, covariance) in joint.covariances.iter_mut().enumerate() {
-                let Some(covariance) = covariance.as_mut().filter(|_| hanging[slot]) else { continue };
-                if joint.direct[slot].len() >= self.params.verdict.min_inliers {
-                    continue;
-                }
-                let turned = PAIR_ROTATION_RAD.powi(2);
-                let lever = turned * (centers[slot] - centers[to]).norm_squared();
-                let shifted = across * (PAIR_DIRECTION_RAD * step.norm()).powi(2);
-                let mut rotation = covariance.fixed_view_mut::<3, 3>(0, 0);
-                rotation += Matrix3::identity() * turned;
-                let mut center = covariance.fixed_view_mut::<3, 3>(3, 3);
-                center += shifted + Matrix3::identity() * lever;
+    /// The pairs whose length planes tell, and the photos that hang on each.
+    fn hung(&self, poses: &[Rigid]) -> Vec<Hung> {
+        let standpoints: Vec<usize> = (0..poses.len()).map(|slot| standpoint(poses, slot)).collect();
+        let hung = |(slots, length)| Hung { slots, length, beyond: self.beyond(&standpoints, slots) };
+        self.lengths().map(hung).collect()
+    }
+
+    /// Puts the photos that hang on a pair whose length planes tell where that pair has them, and states what it leaves
+    /// open.
+    ///
+    /// The points that the pair shares lie on little more than one wall, which adjusted as free points fits many
+    /// directions. Where the scene holds any of these photos, the adjustment stands.
+    fn follow_pairs(&self, joint: &mut Joint) {
+        let mut poses: Vec<Rigid> = joint.model.photos.iter().map(|photo| photo.world_from_camera).collect();
+        for hung in self.hung(&poses) {
+            let held = |slot: &usize| joint.direct[*slot].len() >= self.params.verdict.min_inliers;
+            if (0..poses.len()).filter(|&slot| hung.beyond[slot]).any(|slot| held(&slot)) {
+                continue;
             }
+            hung.follow(&mut poses);
+            hung.state(&poses, &mut joint.covariances);
+        }
+        for (photo, pose) in joint.model.photos.iter_mut().zip(poses) {
+            photo.world_from_camera = pose;
         }
     }
 
     /// The photos that no common points tie to the reference but through the pair.
-    fn beyond(&self, photos: &[JointPhoto], [reference, from, to]: [usize; 3]) -> Vec<bool> {
-        let mut shared = vec![vec![0_usize; photos.len()]; photos.len()];
+    fn beyond(&self, standpoints: &[usize], slots: [usize; 3]) -> Vec<bool> {
+        let mut shared = vec![vec![0_usize; standpoints.len()]; standpoints.len()];
         for local in 0..self.model.points.len() {
             let track = self.track(local);
             for &(a, _) in &track {
                 for &(b, _) in &track {
-                    shared[photos[a].standpoint][photos[b].standpoint] += 1;
+                    shared[standpoints[a]][standpoints[b]] += 1;
                 }
             }
         }
-        let [reference, from, to] = [reference, from, to].map(|slot| photos[slot].standpoint);
-        let mut reached = vec![false; photos.len()];
+        let [reference, from, to] = slots.map(|slot| standpoints[slot]);
+        let mut reached = vec![false; standpoints.len()];
         let mut waiting = vec![reference];
         while let Some(at) = waiting.pop() {
             if std::mem::replace(&mut reached[at], true) {
                 continue;
             }
             let is_pair = |other: usize| (at == from && other == to) || (at == to && other == from);
-            waiting
-                .extend((0..photos.len()).filter(|&other| shared[at][other] >= MIN_TIE && !is_pair(other)));
+            waiting.extend(
+                (0..standpoints.len()).filter(|&other| shared[at][other] >= MIN_TIE && !is_pair(other)),
+            );
         }
-        photos.iter().map(|photo| !reached[photo.standpoint]).collect()
+        standpoints.iter().map(|&standpoint| !reached[standpoint]).collect()
     }
 
     /// What such a length rests on, in words.
@@ -744,7 +819,7 @@ fn seen_from_elsewhere(
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::UnitQuaternion;
+    use nalgebra::{UnitQuaternion, Vector3};
     use setloc_sfm::PointId;
 
     use super::*;

@@ -14,8 +14,8 @@ use setloc_features::{Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match, Ra
 
 use super::{InputImage, MapperInput, MapperOutput, MapperParams};
 use crate::{
-    CameraId, ImageId, Observation, PairGeometry, Reconstruction, ReconstructionImage, Rigid, TwoViewKind,
-    verify_pair,
+    BaselineLength, CameraId, ImageId, Observation, PairGeometry, Reconstruction, ReconstructionImage, Rigid,
+    TwoViewKind, verify_pair,
 };
 
 /// One photo of a mosaic.
@@ -165,7 +165,13 @@ impl<'a> Standpoints<'a> {
         let mut cameras = component.cameras;
         cameras.truncate(self.original.cameras.len());
         let first_of = |image: ImageId| self.mosaics[image.index()].members[0].image;
-        let lengths = component.lengths.iter().map(|length| length.between(first_of)).collect();
+        let mosaic_from_first =
+            |image: ImageId| self.mosaics[image.index()].members[0].image_from_mosaic.inverse();
+        let of_first = |length: &BaselineLength| {
+            let (from, to) = (mosaic_from_first(length.from), mosaic_from_first(length.to));
+            length.turned(&from, &to).between(first_of)
+        };
+        let lengths = component.lengths.iter().map(of_first).collect();
         Reconstruction { cameras, images, points, lengths }
     }
 
