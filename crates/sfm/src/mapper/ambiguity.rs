@@ -1,5 +1,7 @@
 use std::collections::BTreeSet;
 
+use nalgebra::Vector3;
+
 use super::{
     MapperParams,
     adjust::{Scope, adjust, is_adjustable},
@@ -15,6 +17,9 @@ use crate::{
 
 /// Points of an image among which rivals are sought.
 const MOST_POINTS: usize = 200;
+/// Length of the mean of unit bearings below which they point so far apart that one pose only fits: that of a cone with 66° to
+/// its rim.
+const MIN_MEAN_BEARING: f64 = 0.7;
 /// Points were adjusted along with the pose that is doubted, so another may miss them by so many times more.
 const WIDER: f64 = 3.0;
 
@@ -70,6 +75,10 @@ fn rivals(
             sigmas.push(WIDER * rays.sigmas[feature as usize]);
             points.push(point.position);
         }
+    }
+    let mean = bearings.iter().sum::<Vector3<f64>>() / bearings.len().max(1) as f64;
+    if mean.norm() < MIN_MEAN_BEARING {
+        return Vec::new();
     }
     let params = RansacParams { min_inliers: params.min_confirmed_inliers, ..params.ransac() };
     rival_poses(&params, &bearings, &sigmas, &points, current, seed ^ (u64::from(image.0) << 32))

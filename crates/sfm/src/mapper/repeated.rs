@@ -14,8 +14,8 @@ use crate::{ImageId, PairGeometry, Reconstruction, TwoViewKind, verify_pair};
 /// itself. Two rendered rooms with floors of exactly repeated tiles have 0.76 and 0.54, two with other floors 0.03 and 0.05,
 /// rendered streets up to 0.16, real ones 0.22 (trees that match nowhere) and 0.27 (a rider moves with the camera), towns nothing.
 const MIN_REPEATED_SHARE: f64 = 0.4;
-/// Largest angle in degrees from straight down to the middle of what repeats itself. One-sided matches of a wall opposite trees
-/// are right ones.
+/// Largest angle in degrees from straight down to the middle of what such a geometry explains. One-sided matches of a wall
+/// opposite trees are right ones.
 const MAX_POLE_DEG: f64 = 45.0;
 /// Fewest pairs of the rest by which a model is judged, and the share of their matches that must agree with it.
 const MIN_JUDGING_PAIRS: usize = 3;
@@ -114,10 +114,6 @@ pub(super) fn without_repeated_side(input: &MapperInput<'_>, seed: u64) -> Optio
             }
         }
     }
-    let down: Vector3<f64> = poles.iter().sum();
-    if down.angle(&Vector3::y()) > MAX_POLE_DEG.to_radians() {
-        return None;
-    }
     let is_repeated = |image: ImageId, feature: u32| {
         let pole: &Vector3<f64> = &poles[image.index()];
         let bearing = rays[image.index()].as_ref().map(|rays| rays.bearings[feature as usize]);
@@ -143,7 +139,15 @@ pub(super) fn without_repeated_side(input: &MapperInput<'_>, seed: u64) -> Optio
     Some(Remainder { putative, pairs: pairs.concat() })
 }
 
+/// Whether a geometry explains what lies underfoot, and next to nothing else.
 fn is_one_sided([first, second]: [&Rays; 2], pair: &PairGeometry, matches: &[Match]) -> bool {
+    let underfoot = |rays: &Rays, feature: fn(&Match) -> u32| {
+        let seen = pair.two_view.inliers.iter().filter_map(|m| rays.bearings.get(feature(m) as usize));
+        seen.sum::<Vector3<f64>>().angle(&Vector3::y()) <= MAX_POLE_DEG.to_radians()
+    };
+    if !underfoot(first, |m| m.first) || !underfoot(second, |m| m.second) {
+        return false;
+    }
     let explained = count_matches(first, &pair.two_view.inliers);
     let of_matches = compare(&count_matches(first, matches), &explained, MIN_SIDE_MATCHES);
     let shareable = count_shareable(first, second, &pair.two_view.second_from_first.rotation);
