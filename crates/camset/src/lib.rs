@@ -41,4 +41,5 @@ pub use types::{
 /// covariance is asked of its own pose's points. 9: sets take over what is known of their photos alone. 10: lengths that
 /// planes tell hold the set's baselines. 11: matches far astray are no noise. 13: photos of one standpoint are judged by
 /// what any of them sees. 14: photos stand where their pair by planes has them, as well as that tells.
-pub const VERSION: u32 = 14;
+/// 15: only matches hundreds of deviations off are no noise.
+pub const VERSION: u32 = 15;
