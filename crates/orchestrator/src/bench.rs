@@ -2,6 +2,7 @@
 
 mod auc;
 mod baseline;
+mod calibration;
 mod figures;
 mod harness;
 mod html;
@@ -12,6 +13,7 @@ mod tables;
 
 pub use auc::{AUC_THRESHOLDS_DEG, auc_percent};
 pub use baseline::{Baseline, Delta, Judgement};
+pub use calibration::{Calibration, NormalizedError};
 pub use figures::{Alignment, Bounds, Errors, PoseError, SceneFigures, Spread};
 pub use harness::{Harness, HarnessRun, about};
 pub use html::{figures_section, html_report};

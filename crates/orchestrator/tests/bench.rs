@@ -107,8 +107,11 @@ fn a_data_set_by_path_keeps_its_results_schema() {
     let set = &results["sets"][0];
     assert_eq!(keys(set), ["advice", "images", "local_models", "methods", "name", "target"]);
     assert_eq!(keys(&set["methods"]), ["camset", "camset+opt", "single"]);
-    let method = ["position_m", "registered", "rotation_deg", "target", "target_registered"];
+    let method = ["calibration", "position_m", "registered", "rotation_deg", "target", "target_registered"];
     assert_eq!(keys(&set["methods"]["single"]), method);
+    let refined = &set["methods"]["camset+opt"];
+    assert_eq!(keys(&refined["calibration"]), ["mean", "photos", "within_95"]);
+    assert_eq!(refined["calibration"]["photos"], refined["registered"]);
     assert!(folder.path().join("out/seed-1/results.json").is_file());
     assert_eq!(json_of(&folder.path().join("out/repeats.json"))["scene/registered"]["repeats"], 2);
 }

@@ -1,9 +1,11 @@
 use std::collections::BTreeMap;
 
-use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3};
 use serde::Serialize;
 use setloc_features::ImageFeatures;
 use setloc_sfm::{Observation, Reconstruction, ReconstructionPoint, Rigid, Similarity};
+
+use super::NormalizedError;
 
 /// One image's error against truth.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -82,6 +84,19 @@ impl Alignment {
             position_m: (aligned.translation - truth.translation).norm(),
             rotation_deg: aligned.rotation.angle_to(&truth.rotation).to_degrees(),
         }
+    }
+
+    /// The same error in what the pose's covariance (rotation in the camera's frame, then centre in the scene's)
+    /// states; `None` without a positive definite one. What the alignment itself is off counts as the pose's.
+    pub fn normalized_error(
+        &self,
+        estimated: &Rigid,
+        covariance: &Matrix6<f64>,
+        truth: &Rigid,
+    ) -> Option<NormalizedError> {
+        let truth = self.truth_from_scene.inverse().transform_pose(truth);
+        let rotation = (estimated.rotation.inverse() * truth.rotation).scaled_axis();
+        NormalizedError::of(&rotation, &(truth.translation - estimated.translation), covariance)
     }
 }
 

@@ -26,7 +26,7 @@ impl MetricKind {
             last if last.ends_with("_m") => Self::Position,
             last if last.ends_with("_deg") => Self::Rotation,
             last if last.ends_with("_s") => Self::Time,
-            last if last.starts_with("auc") => Self::Percent,
+            last if last.starts_with("auc") || last.ends_with("_percent") => Self::Percent,
             _ => Self::Registered,
         }
     }
@@ -118,6 +118,13 @@ fn flatten(figures: &DatasetFigures) -> Vec<(String, f64)> {
             }
         }
     }
+    // Of all sets together: those of one are too few for a share.
+    let calibrations = || figures.sets.iter().filter_map(|set| set.methods.get("camset+opt")?.calibration);
+    let photos: usize = calibrations().map(|calibration| calibration.photos).sum();
+    if photos > 0 {
+        let within: usize = calibrations().map(|calibration| calibration.within_95).sum();
+        flat.push(("camset+opt/within_95_percent".to_owned(), 100.0 * within as f64 / photos as f64));
+    }
     // A stage that took something from the store has no time of its own.
     for stage in figures.stages.iter().filter(|stage| stage.cached == 0) {
         flat.push((format!("time/{}/cpu_s", stage.name), stage.cpu_s));
@@ -142,6 +149,7 @@ mod tests {
         assert_eq!(MetricKind::of("south/camset+opt/target_m"), MetricKind::Position);
         assert_eq!(MetricKind::of("scene/median_deg"), MetricKind::Rotation);
         assert_eq!(MetricKind::of("scene/auc@0.5"), MetricKind::Percent);
+        assert_eq!(MetricKind::of("camset+opt/within_95_percent"), MetricKind::Percent);
         assert_eq!(MetricKind::of("time/model/cpu_s"), MetricKind::Time);
         assert_eq!(MetricKind::of("south/single/target_registered"), MetricKind::Registered);
     }

@@ -8,7 +8,10 @@ use setloc_camset::{PhotoLocalization, Verdict};
 use setloc_sfm::{Reconstruction, Rigid};
 
 use super::figures::{mean_angular_error_px, own_rotation_errors_deg};
-use super::{AUC_THRESHOLDS_DEG, Alignment, Bounds, Errors, PoseError, SceneFigures, auc_percent};
+use super::{
+    AUC_THRESHOLDS_DEG, Alignment, Bounds, Calibration, Errors, NormalizedError, PoseError, SceneFigures,
+    auc_percent,
+};
 use crate::building::{BuildOutcome, Built, build_scene};
 use crate::config::Config;
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, SkippedImage, Truth, list_images};
@@ -55,9 +58,14 @@ pub struct MethodFigures {
     pub target: Option<PoseError>,
     /// Whether the target is registered.
     pub target_registered: bool,
+    /// How the registered photos' errors compare with their covariances; `None` where none has both.
+    pub calibration: Option<Calibration>,
     /// Errors by name of all photos that have a pose, whatever the verdict.
     #[serde(skip)]
     pub errors: Errors,
+    /// Errors by name in what the covariance states, of all photos that have one.
+    #[serde(skip)]
+    pub normalized: BTreeMap<String, NormalizedError>,
     /// All photos' answers.
     #[serde(skip)]
     pub answers: Vec<PhotoLocalization>,
@@ -288,13 +296,22 @@ fn method_figures(
     let of_all = alignment.map_or_else(Errors::new, |alignment| errors_of(alignment, &posed, truth));
     let mut errors = of_all.clone();
     errors.retain(|name, _| registered.contains(&name.as_str()));
+    let normalized = |photo: &PhotoLocalization| {
+        let (pose, covariance) = (photo.world_from_camera?, photo.covariance?);
+        let error = alignment?.normalized_error(&pose, &covariance, truth.get(&photo.name)?)?;
+        Some((photo.name.clone(), error))
+    };
+    let normalized: BTreeMap<String, NormalizedError> = answers.iter().filter_map(normalized).collect();
+    let of_registered = normalized.iter().filter(|(name, _)| errors.contains_key(*name));
     MethodFigures {
         registered: registered.len(),
         position_m: Bounds::of(errors.values().map(|error| error.position_m)),
         rotation_deg: Bounds::of(errors.values().map(|error| error.rotation_deg)),
         target: errors.get(target).copied(),
         target_registered: registered.contains(&target),
+        calibration: Calibration::of(of_registered.map(|(_, error)| *error)),
         errors: of_all,
+        normalized,
         answers,
     }
 }

@@ -1,6 +1,8 @@
 use std::fmt::Write;
 
-use super::{AUC_THRESHOLDS_DEG, Bounds, DatasetFigures, MethodFigures, SetFigures};
+use super::{
+    AUC_THRESHOLDS_DEG, Bounds, Calibration, DatasetFigures, MethodFigures, NormalizedError, SetFigures,
+};
 
 /// Methods in the paper's order.
 const METHODS: [&str; 3] = ["single", "camset", "camset+opt"];
@@ -34,6 +36,7 @@ pub fn markdown_tables(figures: &DatasetFigures) -> String {
                 }
             }
         }
+        calibration_table(&mut text, figures);
     }
     text += "\n## Time\n\n| stage | jobs run | from cache | wall s | CPU s |\n|---|---|---|---|---|\n";
     for stage in &figures.stages {
@@ -115,23 +118,51 @@ fn error_row(text: &mut String, set: &SetFigures, method: &str, figures: &Method
     }
 }
 
-/// One line an image and method: `set,method,name,position_m,rotation_deg,verdict,inliers`.
+/// How the registered photos' covariances compare with their errors.
+fn calibration_table(text: &mut String, figures: &DatasetFigures) {
+    let of_method =
+        |set: &SetFigures, method| set.methods.get(method).and_then(|figures| figures.calibration);
+    let rows: Vec<(&str, &str, Calibration)> = (figures.sets.iter())
+        .flat_map(|set| METHODS.map(|method| Some((set.name.as_str(), method, of_method(set, method)?))))
+        .flatten()
+        .collect();
+    if rows.is_empty() {
+        return;
+    }
+    *text += "\n## Stated uncertainty\n\nRegistered photos whose true centre lies in the stated 95 % ellipsoid, and mean squared error per coordinate in what\nthe covariance states (1 where it states the truth).\n\n";
+    *text += "| set | method | within 95 % | centre | rotation |\n|---|---|---|---|---|\n";
+    for (set, method, Calibration { photos, within_95, mean }) in rows {
+        let NormalizedError { position, rotation } = mean;
+        add(
+            text,
+            format_args!("| {set} | {method} | {within_95}/{photos} | {position:.2} | {rotation:.2} |\n"),
+        );
+    }
+}
+
+/// One line an image and method. The last two columns are the squared errors per coordinate in what the covariance
+/// states.
 pub fn errors_csv(figures: &DatasetFigures) -> String {
-    let mut text = String::from("set,method,name,position_m,rotation_deg,verdict,inliers,reasons\n");
+    let mut text = String::from(
+        "set,method,name,position_m,rotation_deg,verdict,inliers,reasons,normalized_position,normalized_rotation\n",
+    );
     for (name, error) in &figures.scene_errors {
-        add(&mut text, format_args!(",scene,{name},{},{},,,\n", error.position_m, error.rotation_deg));
+        add(&mut text, format_args!(",scene,{name},{},{},,,,,\n", error.position_m, error.rotation_deg));
     }
     for set in &figures.sets {
         for (method, of_method) in &set.methods {
             for photo in &of_method.answers {
                 let error = of_method.errors.get(&photo.name);
                 let error = error.map_or(",".to_owned(), |e| format!("{},{}", e.position_m, e.rotation_deg));
+                let normalized = of_method.normalized.get(&photo.name);
+                let normalized =
+                    normalized.map_or(",".to_owned(), |e| format!("{},{}", e.position, e.rotation));
                 let (verdict, inliers) = (photo.verdict, photo.inliers);
                 let reasons = photo.reasons.join("; ").replace('"', "'");
                 add(
                     &mut text,
                     format_args!(
-                        "{},{method},{},{error},{verdict:?},{inliers},\"{reasons}\"\n",
+                        "{},{method},{},{error},{verdict:?},{inliers},\"{reasons}\",{normalized}\n",
                         set.name, photo.name
                     ),
                 );
