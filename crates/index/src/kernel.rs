@@ -7,38 +7,64 @@ use setloc_features::DESCRIPTOR_LEN;
 ///
 /// `base` has `out.len()` rows of [`DESCRIPTOR_LEN`] bytes; further rows are ignored.
 pub fn squared_distances(query: &[u8], base: &[u8], out: &mut [u32]) {
-    #[cfg(target_arch = "x86_64")]
-    {
-        if is_x86_feature_detected!("avx512bw") && is_x86_feature_detected!("avx512vnni") {
-            // SAFETY: the processor has the features that the function asks for.
-            unsafe { squared_distances_avx512(query, base, out) };
-            return;
-        }
-        if is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has the only feature that the function asks for.
-            unsafe { squared_distances_avx2(query, base, out) };
+    for path in PATHS {
+        if path(query, base, out) {
             return;
         }
     }
-    squared_distances_portable(query, base, out);
 }
 
-/// The portable loop, compiled for 256-bit integer arithmetic.
+/// One way to [`squared_distances`]; `false`, with `out` untouched, where the processor lacks the instructions.
+type Path = fn(&[u8], &[u8], &mut [u32]) -> bool;
+
+/// All ways, the fastest first; the results are the same.
+const PATHS: &[Path] = &[
+    #[cfg(target_arch = "x86_64")]
+    by_avx512,
+    #[cfg(target_arch = "x86_64")]
+    by_avx2,
+    by_any_processor,
+];
+
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn squared_distances_avx2(query: &[u8], base: &[u8], out: &mut [u32]) {
-    squared_distances_portable(query, base, out);
+fn by_avx512(query: &[u8], base: &[u8], out: &mut [u32]) -> bool {
+    /// The portable loop, compiled for 512-bit integer arithmetic with its multiply-accumulate.
+    #[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
+    fn compiled(query: &[u8], base: &[u8], out: &mut [u32]) {
+        portable(query, base, out);
+    }
+    let is_there = is_x86_feature_detected!("avx512f")
+        && is_x86_feature_detected!("avx512bw")
+        && is_x86_feature_detected!("avx512vnni");
+    if is_there {
+        // SAFETY: the processor has all features that the function asks for.
+        unsafe { compiled(query, base, out) };
+    }
+    is_there
 }
 
-/// The portable loop, compiled for 512-bit integer arithmetic with its multiply-accumulate.
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
-fn squared_distances_avx512(query: &[u8], base: &[u8], out: &mut [u32]) {
-    squared_distances_portable(query, base, out);
+fn by_avx2(query: &[u8], base: &[u8], out: &mut [u32]) -> bool {
+    /// The portable loop, compiled for 256-bit integer arithmetic.
+    #[target_feature(enable = "avx2")]
+    fn compiled(query: &[u8], base: &[u8], out: &mut [u32]) {
+        portable(query, base, out);
+    }
+    let is_there = is_x86_feature_detected!("avx2");
+    if is_there {
+        // SAFETY: the processor has the only feature that the function asks for.
+        unsafe { compiled(query, base, out) };
+    }
+    is_there
+}
+
+fn by_any_processor(query: &[u8], base: &[u8], out: &mut [u32]) -> bool {
+    portable(query, base, out);
+    true
 }
 
 #[inline(always)]
-fn squared_distances_portable(query: &[u8], base: &[u8], out: &mut [u32]) {
+fn portable(query: &[u8], base: &[u8], out: &mut [u32]) {
     let mut wide = [0_i16; DESCRIPTOR_LEN];
     for (wide, &byte) in wide.iter_mut().zip(query) {
         *wide = i16::from(byte);
@@ -72,11 +98,15 @@ mod tests {
         for query in &queries {
             let expected: Vec<u32> =
                 base.chunks_exact(DESCRIPTOR_LEN).map(|row| squared_distance(query, row)).collect();
-            let (mut fast, mut portable) = (vec![0; rows], vec![0; rows]);
-            squared_distances(query, &base, &mut fast);
-            squared_distances_portable(query, &base, &mut portable);
-            assert_eq!(fast, expected);
-            assert_eq!(portable, expected);
+            let by = |path: Path| {
+                let mut found = vec![0; rows];
+                path(query, &base, &mut found).then_some(found)
+            };
+            let found: Vec<Vec<u32>> = PATHS.iter().filter_map(|path| by(*path)).collect();
+            assert!(!found.is_empty() && found.iter().all(|found| *found == expected));
+            let mut found = vec![0; rows];
+            squared_distances(query, &base, &mut found);
+            assert_eq!(found, expected);
         }
         assert_eq!(squared_distance(&queries[0], &base[..DESCRIPTOR_LEN]), 128 * 255 * 255);
     }
