@@ -52,9 +52,7 @@ impl<'a> PhotoRays<'a> {
         point: &Vector3<f64>,
         point_covariance: &nalgebra::Matrix3<f64>,
     ) -> f64 {
-        let pixel = &seen.place.pixel;
-        let ray = self.camera.unproject(pixel).zip(self.camera.pixel_angle(pixel));
-        let Some((bearing, angle)) = ray else { return f64::INFINITY };
+        let Some((bearing, angle)) = self.camera.ray(&seen.place.pixel) else { return f64::INFINITY };
         let offset = point - world_from_camera.translation;
         let bearing = world_from_camera.rotation * bearing;
         ray_error_sigmas(&bearing, seen.keypoint_noise_px * angle, &offset, point_covariance)

@@ -263,9 +263,8 @@ fn leave_out_strays(problem: &mut BundleProblem, origins: &mut Vec<Origin>) {
     let is_stray = |seen: &BundleObservation| {
         let BundlePose { camera, world_from_camera, .. } = &problem.poses[seen.pose as usize];
         let camera = &problem.cameras[*camera as usize];
-        let ray = camera.unproject(&seen.pixel).zip(camera.pixel_angle(&seen.pixel));
         let offset = problem.points[seen.point as usize].position - world_from_camera.translation;
-        let error = ray.map(|(bearing, angle)| {
+        let error = camera.ray(&seen.pixel).map(|(bearing, angle)| {
             let bearing = world_from_camera.rotation * bearing;
             ray_error_sigmas(&bearing, angle * seen.noise_px, &offset, &Matrix3::zeros())
         });

@@ -171,6 +171,13 @@ pub struct InputImage<'a> {
     pub mosaic: Option<&'a Mosaic>,
 }
 
+impl<'a> InputImage<'a> {
+    /// A plain image whose centre was not measured.
+    pub fn new(name: &'a str, camera: CameraId, features: &'a ImageFeatures) -> Self {
+        Self { name, camera, features, position_prior: None, mosaic: None }
+    }
+}
+
 /// What the mapper works on.
 #[derive(Debug, Clone)]
 pub struct MapperInput<'a> {

@@ -143,13 +143,7 @@ impl Corner {
                 }
             }
         }
-        let images = self.features.iter().map(|features| InputImage {
-            name: "photo",
-            camera: CameraId(0),
-            features,
-            position_prior: None,
-            mosaic: None,
-        });
+        let images = self.features.iter().map(|features| InputImage::new("photo", CameraId(0), features));
         let input = MapperInput {
             cameras: vec![self.camera.clone()],
             camera_fixed: vec![true],

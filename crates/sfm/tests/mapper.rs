@@ -139,12 +139,9 @@ impl Street {
         }
         // Photos share one camera, panoramas have one each: both are allowed.
         let shared = cameras.iter().all(|camera| camera == &cameras[0]);
-        let images = (0..self.features.len()).map(|index| InputImage {
-            name: &self.names[index],
-            camera: CameraId(if shared { 0 } else { index as u32 }),
-            features: &self.features[index],
-            position_prior: None,
-            mosaic: None,
+        let images = (0..self.features.len()).map(|index| {
+            let camera = CameraId(if shared { 0 } else { index as u32 });
+            InputImage::new(&self.names[index], camera, &self.features[index])
         });
         let cameras = if shared { vec![cameras[0].clone()] } else { cameras.to_vec() };
         let input = MapperInput {
@@ -323,11 +320,8 @@ impl Street {
             Some(self.truth[index].translation + Vector3::new(0.0, 0.0, jump + 3.0 * (index % 2) as f64))
         };
         let images = (0..self.features.len()).map(|index| InputImage {
-            name: &self.names[index],
-            camera: CameraId(index as u32),
-            features: &self.features[index],
             position_prior: jump_m.and_then(|_| measured(index)),
-            mosaic: None,
+            ..InputImage::new(&self.names[index], CameraId(index as u32), &self.features[index])
         });
         let input = MapperInput {
             camera_fixed: vec![true; self.cameras.len()],

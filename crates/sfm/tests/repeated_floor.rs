@@ -103,13 +103,8 @@ impl Room {
             pairs.extend(views.into_iter().map(|two_view| PairGeometry { first, second, two_view }));
             putative.push(PutativePair { first, second, matches });
         }
-        let images = (self.features.iter().zip(&names)).map(|(features, name)| InputImage {
-            name,
-            camera: CameraId(0),
-            features,
-            position_prior: None,
-            mosaic: None,
-        });
+        let images = (self.features.iter().zip(&names))
+            .map(|(features, name)| InputImage::new(name, CameraId(0), features));
         let input = MapperInput {
             cameras: vec![self.camera.clone()],
             camera_fixed: vec![true],

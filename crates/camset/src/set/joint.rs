@@ -138,12 +138,10 @@ impl Hung {
         let of_far = match (covariances[reference], covariances[from]) {
             (Some(of_reference), Some(of_near)) => {
                 let step = far.translation - near.translation;
-                let mut carried = Matrix6::identity();
-                let turn = |pose: &Rigid| pose.rotation.to_rotation_matrix().into_inner();
-                carried.fixed_view_mut::<3, 3>(0, 0).copy_from(&(turn(far).transpose() * turn(near)));
-                carried.fixed_view_mut::<3, 3>(3, 0).copy_from(&-(step.cross_matrix() * turn(near)));
+                let carried = carried(near, far);
                 let mut own = Matrix6::identity();
-                own.fixed_view_mut::<3, 3>(3, 3).copy_from(&(turn(near) * baseline.norm()));
+                let world_from_near = near.rotation.to_rotation_matrix().into_inner();
+                own.fixed_view_mut::<3, 3>(3, 3).copy_from(&(world_from_near * baseline.norm()));
                 let along = baseline.normalize();
                 let center = |covariance: &Matrix6<f64>| covariance.fixed_view::<3, 3>(3, 3).into_owned();
                 let of_baseline = along.dot(&((center(&of_reference) + center(&of_near)) * along));
@@ -160,22 +158,29 @@ impl Hung {
                 *covariance = None;
                 continue;
             };
-            let pose = &poses[slot];
-            let lever = pose.translation - far.translation;
-            let world_from_far = far.rotation.to_rotation_matrix().into_inner();
-            let mut carried = Matrix6::identity();
-            let turned = pose.rotation.inverse().to_rotation_matrix().into_inner() * world_from_far;
-            carried.fixed_view_mut::<3, 3>(0, 0).copy_from(&turned);
-            carried.fixed_view_mut::<3, 3>(3, 0).copy_from(&-(lever.cross_matrix() * world_from_far));
+            let carried = carried(far, &poses[slot]);
             let by_pair = carried * of_far * carried.transpose();
             // What lies between photos beyond the pair is in the adjustment's.
-            *covariance = match (lever.norm() > 0.0, *covariance) {
+            let is_elsewhere = (poses[slot].translation - far.translation).norm() > 0.0;
+            *covariance = match (is_elsewhere, *covariance) {
                 (true, Some(own)) => Some(own + by_pair),
                 (true, None) => None,
                 (false, _) => Some(by_pair),
             };
         }
     }
+}
+
+/// How a small error of one pose moves another that is rigidly tied to it: 6×6, both rotations about the camera's axes,
+/// then the centres in the world.
+fn carried(from: &Rigid, to: &Rigid) -> Matrix6<f64> {
+    let [world_from_from, world_from_to] =
+        [from, to].map(|pose| pose.rotation.to_rotation_matrix().into_inner());
+    let lever = to.translation - from.translation;
+    let mut carried = Matrix6::identity();
+    carried.fixed_view_mut::<3, 3>(0, 0).copy_from(&(world_from_to.transpose() * world_from_from));
+    carried.fixed_view_mut::<3, 3>(3, 0).copy_from(&-(lever.cross_matrix() * world_from_from));
+    carried
 }
 
 impl Component<'_> {

@@ -155,8 +155,7 @@ pub fn mean_angular_error_px(
     let error = |observation: &Observation, position: &Vector3<f64>| {
         let pose = model.images[observation.image.index()].world_from_camera?;
         let keypoint = of_image[observation.image.index()]?.keypoints.get(observation.feature as usize)?;
-        let camera = model.camera_of(observation.image);
-        let (bearing, unit) = (camera.unproject(&keypoint.pixel())?, camera.pixel_angle(&keypoint.pixel())?);
+        let (bearing, unit) = model.camera_of(observation.image).ray(&keypoint.pixel())?;
         Some(pose.inverse_transform_point(position).angle(&bearing) / unit)
     };
     let of_point = |point: &ReconstructionPoint| -> Vec<f64> {

@@ -311,11 +311,8 @@ fn run_model(
     }
     let names: Vec<String> = features.iter().map(|(at, _)| place_holder(*at)).collect();
     let images = features.iter().zip(&names).map(|((at, features), name)| InputImage {
-        name,
-        camera: CameraId(input.cameras.of_image[*at] as u32),
-        features,
         position_prior: input.positions[*at],
-        mosaic: None,
+        ..InputImage::new(name, CameraId(input.cameras.of_image[*at] as u32), features)
     });
     let images = images.collect();
     let (cameras, camera_fixed) = (input.cameras.cameras.clone(), input.cameras.fixed.clone());

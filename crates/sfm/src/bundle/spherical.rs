@@ -425,8 +425,8 @@ fn bearing_and_weight(camera: &Camera, pixel: &Vector2<f64>, noise_px: f64) -> O
     if !(pixel.x.is_finite() && pixel.y.is_finite() && noise_px.is_finite() && noise_px > 0.0) {
         return None;
     }
-    let bearing = camera.unproject(pixel)?;
-    let weight = 1.0 / (camera.pixel_angle(pixel)? * noise_px);
+    let (bearing, pixel_angle) = camera.ray(pixel)?;
+    let weight = 1.0 / (pixel_angle * noise_px);
     (bearing.norm_squared().is_finite() && weight.is_finite() && weight > 0.0).then_some((bearing, weight))
 }
 
@@ -468,10 +468,11 @@ struct UnprojectJacobian {
 
 /// κ and its derivatives by the intrinsics, by central differences.
 fn unproject_with_jacobian(camera: &Camera, pixel: &Vector2<f64>) -> Option<UnprojectJacobian> {
+    let (bearing, pixel_angle) = camera.ray(pixel)?;
     let mut result = UnprojectJacobian {
-        bearing: camera.unproject(pixel)?,
+        bearing,
         d_params: SMatrix::zeros(),
-        pixel_angle: camera.pixel_angle(pixel)?,
+        pixel_angle,
         d_log_pixel_angle: [0.0; MAX_CAMERA_PARAMS],
     };
     let mut moved = camera.clone();
@@ -479,7 +480,7 @@ fn unproject_with_jacobian(camera: &Camera, pixel: &Vector2<f64>) -> Option<Unpr
         let h = 1e-6 * value.abs().max(1.0);
         let mut at = |value: f64| {
             moved.params[index] = value;
-            Some((moved.unproject(pixel)?, moved.pixel_angle(pixel)?))
+            moved.ray(pixel)
         };
         if let (Some((after, angle_after)), Some((before, angle_before))) = (at(value + h), at(value - h)) {
             result.d_params.set_column(index, &((after - before) / (2.0 * h)));

@@ -4,16 +4,10 @@ use rand_chacha::ChaCha8Rng;
 use setloc_features::{Camera, CameraModel};
 
 use super::*;
-use crate::{Rigid, Similarity};
+use crate::{Rigid, Similarity, synthetic::normal};
 
 fn vector(rng: &mut ChaCha8Rng) -> Vector3<f64> {
     Vector3::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0))
-}
-
-/// Standard normal, Box–Muller.
-fn normal(rng: &mut ChaCha8Rng) -> f64 {
-    let (a, b): (f64, f64) = (rng.random_range(f64::MIN_POSITIVE..1.0), rng.random());
-    (-2.0 * a.ln()).sqrt() * (std::f64::consts::TAU * b).cos()
 }
 
 fn pinhole() -> Camera {
@@ -108,10 +102,12 @@ fn largest_error(found: &BundleProblem, truth: &BundleProblem) -> (f64, f64) {
     worst
 }
 
-fn is_seen(problem: &BundleProblem) -> Vec<bool> {
-    let mut seen = vec![false; problem.points.len()];
-    problem.observations.iter().for_each(|observation| seen[observation.point as usize] = true);
-    seen
+fn assert_seen_points_are_found(found: &BundleProblem, truth: &BundleProblem) {
+    let mut seen = vec![false; truth.points.len()];
+    truth.observations.iter().for_each(|observation| seen[observation.point as usize] = true);
+    for (index, (found, truth)) in found.points.iter().zip(&truth.points).enumerate() {
+        assert!(!seen[index] || (found.position - truth.position).norm() < 1e-7);
+    }
 }
 
 fn tight() -> BundleParams {
@@ -191,10 +187,7 @@ fn fixed_poses_and_points_stay_bit_identical_and_hold_the_frame() {
     for (found, truth) in problem.poses.iter().zip(&truth.poses) {
         assert!((found.world_from_camera.translation - truth.world_from_camera.translation).norm() < 1e-9);
     }
-    let seen = is_seen(&truth);
-    for (index, (found, truth)) in problem.points.iter().zip(&truth.points).enumerate() {
-        assert!(!seen[index] || (found.position - truth.position).norm() < 1e-7);
-    }
+    assert_seen_points_are_found(&problem, &truth);
 }
 
 #[test]
@@ -222,10 +215,7 @@ fn points_alone_are_found_when_all_poses_are_fixed() {
     }
     perturb(&mut problem, 0.05, 14);
     solve(&tight(), &mut problem);
-    let seen = is_seen(&truth);
-    for (index, (found, truth)) in problem.points.iter().zip(&truth.points).enumerate() {
-        assert!(!seen[index] || (found.position - truth.position).norm() < 1e-7);
-    }
+    assert_seen_points_are_found(&problem, &truth);
 }
 
 #[test]

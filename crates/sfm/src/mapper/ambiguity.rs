@@ -212,13 +212,7 @@ mod tests {
         for seed in ["a", "b", "c", "d", "e", "f"] {
             let photos = photos(&camera, seed);
             let (pairs, image) = (pairs(), ImageId(3));
-            let images = photos.iter().map(|features| InputImage {
-                name: "photo",
-                camera: CameraId(0),
-                features,
-                position_prior: None,
-                mosaic: None,
-            });
+            let images = photos.iter().map(|features| InputImage::new("photo", CameraId(0), features));
             let input = MapperInput {
                 cameras: vec![camera.clone()],
                 camera_fixed: vec![true],

@@ -150,8 +150,10 @@ fn is_one_sided([first, second]: [&Rays; 2], pair: &PairGeometry, matches: &[Mat
     }
     let explained = count_matches(first, &pair.two_view.inliers);
     let of_matches = compare(&count_matches(first, matches), &explained, MIN_SIDE_MATCHES);
+    if of_matches.worst < MIN_SIDE_SHARE {
+        return true;
+    }
     let shareable = count_shareable(first, second, &pair.two_view.second_from_first.rotation);
     let of_keypoints = compare(&shareable, &explained, MIN_SIDE_KEYPOINTS);
-    of_matches.worst < MIN_SIDE_SHARE
-        || (of_keypoints.best > NEAR_SHARE && of_keypoints.worst < MIN_NEAR_SIDE_SHARE)
+    of_keypoints.best > NEAR_SHARE && of_keypoints.worst < MIN_NEAR_SIDE_SHARE
 }

@@ -76,7 +76,8 @@ pub(super) fn count_shareable(
     second: &Rays,
     second_from_first: &UnitQuaternion<f64>,
 ) -> Counts {
-    let turned: Vec<Vector3<f64>> = second.bearings.iter().map(|b| second_from_first.inverse() * b).collect();
+    let first_from_second = second_from_first.inverse();
+    let turned: Vec<Vector3<f64>> = second.bearings.iter().map(|b| first_from_second * b).collect();
     let (mut shareable, others) = (count(first.bearings.iter()), count(turned.iter()));
     for (count, other) in shareable.iter_mut().zip(others) {
         *count = (*count).min(other);

@@ -105,13 +105,13 @@ pub fn rival_poses(
         }
     }
     rivals.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let mut distinct: Vec<Rigid> = Vec::new();
+    let mut kept: Vec<Rigid> = Vec::new();
     for (_, pose) in rivals {
-        if distinct.len() < MAX_RIVALS && distinct.iter().all(|other| differ(&pose, other)) {
-            distinct.push(pose);
+        if kept.len() < MAX_RIVALS && kept.iter().all(|other| differ(&pose, other)) {
+            kept.push(pose);
         }
     }
-    distinct
+    kept
 }
 
 /// Most rivals of a pose.
