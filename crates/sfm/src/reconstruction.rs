@@ -114,6 +114,11 @@ impl BaselineLength {
         ([self.reference, self.from, self.to], length)
     }
 
+    /// Whether an image is one of the three.
+    pub(crate) fn involves(&self, image: ImageId) -> bool {
+        [self.reference, self.from, self.to].contains(&image)
+    }
+
     /// Holds it in an adjustment, where all three images take part in it.
     pub(crate) fn hold_in(&self, problem: &mut BundleProblem, pose_of: impl Fn(ImageId) -> Option<u32>) {
         let (images, length) = self.held();

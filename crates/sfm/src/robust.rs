@@ -4,7 +4,7 @@
 //! rays of different cameras and accuracies mix. A ray supports a model only with positive depth. The same seed gives
 //! the same bytes.
 
-mod absolute_pose;
+pub(crate) mod absolute_pose;
 mod absolute_pose_focal;
 mod generalized_pose;
 pub(crate) mod least_squares;

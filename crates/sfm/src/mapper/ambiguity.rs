@@ -37,7 +37,7 @@ pub(super) fn settle_pose(
     image: ImageId,
     seed: u64,
 ) {
-    if !is_adjustable(model, image) || model.lengths.iter().any(|length| length.to == image) {
+    if !is_adjustable(model, image) || model.lengths.iter().any(|length| length.involves(image)) {
         return;
     }
     let Some(current) = model.poses[image.index()].map(|pose| pose.world_from_camera) else { return };
@@ -136,13 +136,13 @@ fn cost(model: &Model<'_>, params: &MapperParams, image: ImageId, features: &BTr
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{UnitQuaternion, Vector3};
+    use nalgebra::{Matrix6, UnitQuaternion, Vector3};
     use rand::Rng;
     use setloc_features::{Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
 
     use super::*;
     use crate::{
-        CameraId, InputImage, MapperInput, PairGeometry, TwoView, TwoViewKind, TwoViewParams,
+        BaselineLength, CameraId, InputImage, MapperInput, PairGeometry, TwoView, TwoViewKind, TwoViewParams,
         synthetic::{normal, rotation_angle, seeded},
     };
 
@@ -204,8 +204,13 @@ mod tests {
         [(0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3)].map(|(a, b)| pair(a, b)).to_vec()
     }
 
+    fn length_of([reference, from, to]: [ImageId; 3]) -> BaselineLength {
+        let (pose, covariance) = (Rigid::default(), Matrix6::identity());
+        BaselineLength { reference, from, to, ratio: 1.0, deviation: 0.1, votes: 10, pose, covariance }
+    }
+
     #[test]
-    fn a_mistaken_pose_before_a_far_wall_is_put_right() {
+    fn a_mistaken_pose_before_a_far_wall_is_put_right_unless_a_length_rests_on_it() {
         let (camera, params, truth) =
             (Camera::from_focal_guess(1200, 900, 900.0), MapperParams::default(), poses());
         let mut mistaken = 0;
@@ -237,6 +242,13 @@ mod tests {
                 };
                 if off(&wrong) > 0.2 {
                     mistaken += 1;
+                    for images in [[3, 0, 1], [0, 3, 1], [0, 1, 3]] {
+                        let mut held = wrong.clone();
+                        let length = length_of(images.map(ImageId));
+                        held.lengths.push(length);
+                        settle_pose(&mut held, &graph, &params, image, 1);
+                        assert_eq!((off(&held), held.lengths), (off(&wrong), vec![length]));
+                    }
                     settle_pose(&mut wrong, &graph, &params, image, 1);
                     assert!(off(&wrong) < 0.05, "{seed}: {}", off(&wrong));
                 }

@@ -291,7 +291,7 @@ impl<'a> Model<'a> {
                 }
             }
         }
-        self.lengths.retain(|length| ![length.reference, length.from, length.to].contains(&image));
+        self.lengths.retain(|length| !length.involves(image));
         self.set_pose(image, None);
     }
 

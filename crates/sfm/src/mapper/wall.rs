@@ -6,12 +6,14 @@
 //! J. Košecká, S. Sastry, "An Invitation to 3-D Vision", 2004, § 5.3.3). Points on known planes beside the wall then
 //! give the length and sharpen the rest.
 
-use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector2, Vector3};
 
 use crate::{
     Rigid,
     robust::{
-        AngularResidual, RansacParams, estimate_ray_homography,
+        AngularResidual, RansacParams,
+        absolute_pose::turned,
+        estimate_ray_homography,
         least_squares::{LeastSquares, Normal, cauchy, minimize},
     },
     solvers::tangent_basis,
@@ -421,9 +423,8 @@ impl LeastSquares<UNKNOWNS> for WallFit<'_> {
 
     fn step(&self, pair: &WallPair, delta: &SVector<f64, UNKNOWNS>) -> WallPair {
         let (u, v) = tangent_basis(&pair.normal);
-        let turn = UnitQuaternion::from_scaled_axis(delta.fixed_rows::<3>(0).into_owned());
         WallPair {
-            rotation: turn.to_rotation_matrix().into_inner() * pair.rotation,
+            rotation: turned(&pair.rotation, &delta.fixed_rows::<3>(0).into_owned()),
             translation: pair.translation + delta.fixed_rows::<3>(3),
             normal: (pair.normal + u * delta[6] + v * delta[7]).normalize(),
             distance: pair.distance * delta[8].exp(),
@@ -434,6 +435,7 @@ impl LeastSquares<UNKNOWNS> for WallFit<'_> {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::UnitQuaternion;
     use rand::Rng;
 
     use super::*;

@@ -250,7 +250,7 @@ impl LeastSquares<6> for AbsoluteFit<'_> {
 }
 
 /// exp(δω)·R, with the rounding of many products removed.
-pub(super) fn turned(rotation: &Matrix3<f64>, delta: &Vector3<f64>) -> Matrix3<f64> {
+pub(crate) fn turned(rotation: &Matrix3<f64>, delta: &Vector3<f64>) -> Matrix3<f64> {
     let turned = UnitQuaternion::from_scaled_axis(*delta)
         * UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(*rotation));
     turned.to_rotation_matrix().into_inner()
