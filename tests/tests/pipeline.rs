@@ -10,12 +10,17 @@ use setloc_orchestrator::bench::{BenchGps, BenchOptions, DatasetFigures, bench_d
 use setloc_orchestrator::config::Config;
 use setloc_orchestrator::session::{Limits, Session};
 use setloc_orchestrator::stages;
+use setloc_town::{TownParams, write_dataset};
 
 fn bench(dataset: &Path) -> DatasetFigures {
+    bench_with(dataset, Config::default())
+}
+
+fn bench_with(dataset: &Path, config: Config) -> DatasetFigures {
     let store = tempfile::tempdir().unwrap();
     let limits = Limits { threads: 2, memory: 4 << 30 };
     let session = Session::open(store.path(), None, limits, Arc::new(AtomicBool::new(false))).unwrap();
-    let options = BenchOptions { config: Config::default(), seed: 0, gps: BenchGps::None };
+    let options = BenchOptions { config, seed: 0, gps: BenchGps::None };
     bench_dataset(&session, dataset, &options).unwrap()
 }
 
@@ -60,4 +65,32 @@ fn the_small_rendered_street_is_mapped_and_its_set_located() {
         return;
     }
     assert_main_job(&bench(&dataset));
+}
+
+#[test]
+fn photos_between_panoramas_that_share_little_are_placed_by_what_each_shows() {
+    let folder = tempfile::tempdir().unwrap();
+    let params = TownParams {
+        seed: 8305,
+        panoramas: 3,
+        panorama_step_m: 7.0,
+        panorama_width: 1024,
+        photos: 3,
+        photo_width: 1024,
+        sensor_noise: 4.0,
+        ..TownParams::default()
+    };
+    write_dataset(folder.path(), &params, 90).unwrap();
+    let refined = |max_images: usize| {
+        let mut config = Config::default();
+        config.camset.views.max_images = max_images;
+        let mut figures = bench_with(folder.path(), config);
+        figures.sets[0].methods.remove("camset+opt").unwrap()
+    };
+    let by_points = refined(0);
+    assert_eq!(by_points.registered, 0, "the points alone do: {by_points:?}");
+    let by_views = refined(48);
+    assert!(by_views.registered >= 2, "{by_views:?}");
+    let (position, rotation) = (by_views.position_m.unwrap(), by_views.rotation_deg.unwrap());
+    assert!(position.max < 0.1 && rotation.max < 0.5, "{position:?} {rotation:?}");
 }

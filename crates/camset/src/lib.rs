@@ -24,6 +24,7 @@ mod single;
 mod test_scene;
 mod types;
 mod verdict;
+mod views;
 
 pub use advice::{Link, PathToScene};
 pub use params::{CamsetMethod, CamsetParams, GuidedParams, SingleParams, VerdictParams};
@@ -32,6 +33,7 @@ pub use single::locate_single;
 pub use types::{
     PhotoLocalization, QueryPhoto, Scene, SceneMatch, SetLocalization, SingleLocalization, Verdict,
 };
+pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match_views};
 
 /// Version of the answers; bumped whenever equal inputs give another answer.
 ///
@@ -41,5 +43,6 @@ pub use types::{
 /// covariance is asked of its own pose's points. 9: sets take over what is known of their photos alone. 10: lengths that
 /// planes tell hold the set's baselines. 11: matches far astray are no noise. 13: photos of one standpoint are judged by
 /// what any of them sees. 14: photos stand where their pair by planes has them, as well as that tells.
-/// 15: only matches hundreds of deviations off are no noise.
-pub const VERSION: u32 = 15;
+/// 15: only matches hundreds of deviations off are no noise. 16: what points do not localize is matched with the scene's
+/// images.
+pub const VERSION: u32 = 16;

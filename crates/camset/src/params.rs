@@ -1,5 +1,7 @@
 use serde::{Deserialize, Serialize};
 
+use crate::ViewParams;
+
 /// When a pose may be called localized.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -118,6 +120,8 @@ pub struct CamsetParams {
     pub max_error_sigmas: f64,
     /// Search around projections once poses are known.
     pub guided: GuidedParams,
+    /// Matching with the scene's images beside its points, for photos that these do not localize.
+    pub views: ViewParams,
     /// When poses may be used.
     pub verdict: VerdictParams,
 }
@@ -133,6 +137,7 @@ impl Default for CamsetParams {
             rounds: 3,
             max_error_sigmas: 4.0,
             guided: GuidedParams::default(),
+            views: ViewParams::default(),
             verdict: VerdictParams::default(),
         }
     }
@@ -146,6 +151,7 @@ impl CamsetParams {
             ratio: 0.6,
             reverse_ratio: 0.6,
             lone_rays: false,
+            views: ViewParams { max_images: 0 },
             ..Self::default()
         }
     }

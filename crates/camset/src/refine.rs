@@ -9,11 +9,11 @@ use setloc_sfm::bundle::{
     self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
     LengthRatio, RobustLoss,
 };
-use setloc_sfm::{Place, PointId, Rigid};
+use setloc_sfm::{ImageId, Place, PointId, Rigid};
 
-use crate::SceneMatch;
 use crate::evidence::{PhotoRays, ray_error_sigmas};
 use crate::jackknife::honest_covariances;
+use crate::{Scene, SceneMatch};
 
 /// Scale of the robust loss in standard deviations: at one deviation an observation has half its weight, at four (an
 /// inlier still) a seventeenth, so leftovers among the matches hardly pull.
@@ -67,6 +67,15 @@ pub(crate) struct JointObservations {
     pub tied: Vec<TiedPoint>,
     /// Free local points, by their index, and where they are seen.
     pub tracks: Vec<(usize, Sighting)>,
+    /// Free local points, by their index, and where images of the scene show them.
+    pub views: Vec<(usize, SceneView)>,
+}
+
+/// A place in an image of the scene.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct SceneView {
+    pub image: ImageId,
+    pub place: Place,
 }
 
 /// A local point that is a scene point.
@@ -86,11 +95,12 @@ pub(crate) struct TiedPoint {
 /// stay where they are.
 pub(crate) fn refine_jointly(
     model: &mut JointModel,
-    index: &SceneIndex,
+    scene: &Scene<'_>,
     rays: &[PhotoRays<'_>],
     observed: &JointObservations,
     with_covariance: bool,
 ) -> Vec<Option<Matrix6<f64>>> {
+    let Scene { reconstruction: scene, index } = *scene;
     let standpoints = Standpoints::new(&model.photos);
     let mut builder = Builder {
         points: model.points.iter().map(|&position| BundlePoint { position, fixed: false }).collect(),
@@ -138,6 +148,18 @@ pub(crate) fn refine_jointly(
             observations.push(BundleObservation { pose, point, pixel, noise_px });
             origins.push(Origin::Far);
         }
+    }
+    let mut pose_of_view: BTreeMap<ImageId, u32> = BTreeMap::new();
+    for (point, view) in &observed.views {
+        let Some(world_from_camera) = scene.images[view.image.index()].world_from_camera else { continue };
+        let pose = *pose_of_view.entry(view.image).or_insert_with(|| {
+            poses.push(BundlePose { camera: cameras.len() as u32, world_from_camera, fixed: true });
+            cameras.push(scene.camera_of(view.image).clone());
+            poses.len() as u32 - 1
+        });
+        let Place { pixel, noise_px } = view.place;
+        observations.push(BundleObservation { pose, point: *point as u32, pixel, noise_px });
+        origins.push(Origin::Scene);
     }
     let mut problem =
         BundleProblem { cameras, camera_freedom, poses, points, observations, ..BundleProblem::default() };
@@ -487,7 +509,7 @@ mod tests {
         };
         let rays = [PhotoRays::new(&view.features, &world.camera)];
         let seen = JointObservations { direct: vec![matches], ..JointObservations::default() };
-        let covariances = refine_jointly(&mut model, &world.index, &rays, &seen, true);
+        let covariances = refine_jointly(&mut model, &world.scene(), &rays, &seen, true);
         let (center, rotation) = world.errors(0, &model.photos[0].world_from_camera);
         assert!(center < 0.03 && rotation < 0.1, "{center} {rotation}");
         let covariance = covariances[0].expect("fixed points leave nothing undetermined");
@@ -511,7 +533,7 @@ mod tests {
             };
             let rays = [PhotoRays::new(&view.features, &world.camera)];
             let seen = JointObservations { direct: vec![matches], ..JointObservations::default() };
-            refine_jointly(&mut model, &world.index, &rays, &seen, true)[0].expect("is determined").trace()
+            refine_jointly(&mut model, &world.scene(), &rays, &seen, true)[0].expect("is determined").trace()
         };
         let ratio = trace(300.0) / trace(0.0);
         assert!((0.8..1.25).contains(&ratio), "{ratio}");

@@ -3,14 +3,16 @@
 mod correspondences;
 mod joint;
 mod rigid;
+mod sights;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use setloc_sfm::{ImageId, Reconstruction};
+use setloc_sfm::{CameraId, ImageId, Reconstruction, ReconstructionImage, Rigid};
 
 use crate::advice::widest_paths;
 use crate::{
-    CamsetParams, PhotoLocalization, QueryPhoto, Scene, SetLocalization, SingleLocalization, Verdict,
+    CamsetParams, PhotoLocalization, QueryPhoto, Scene, SetLocalization, SingleLocalization, Verdict, Views,
+    verdict::standard_deviations,
 };
 
 use joint::{Component, ComponentAnswer};
@@ -21,33 +23,92 @@ use joint::{Component, ComponentAnswer};
 /// `alone` is what [`locate_single`](crate::locate_single) says of each photo; photos beyond its end are left out.
 /// Every other photo gets an answer: from the first model that localizes it, else alone. (L. Deng et al., "Image set
 /// querying based localization", VCIP 2015.)
+///
+/// `views` is asked for what the photos share with the scene's images beside its points ([`crate::match_views`]), only
+/// where photos are left that the points do not localize.
 pub fn locate_set(
     params: &CamsetParams,
     scene: &Scene<'_>,
     photos: &[QueryPhoto<'_>],
     alone: &[&SingleLocalization],
     local_models: &[Reconstruction],
+    views: impl FnOnce() -> Views,
     seed: u64,
 ) -> SetLocalization {
     let photos = &photos[..photos.len().min(alone.len())];
     let evidence = &alone[..photos.len()];
+    let by_points = locate_by(params, scene, (photos, evidence), local_models, &Views::default(), seed);
+    if by_points.refined.iter().all(|photo| photo.verdict == Verdict::Localized) {
+        return by_points;
+    }
+    let views = views();
+    if views.matches.is_empty() {
+        return by_points;
+    }
+    let by_views = locate_by(params, scene, (photos, evidence), local_models, &views, seed);
+    better_of(by_points, by_views)
+}
+
+/// Of two answers the one in which more is localized, photo by photo; the first, where they contradict each other.
+fn better_of(first: SetLocalization, second: SetLocalization) -> SetLocalization {
+    let pairs = || first.refined.iter().zip(&second.refined);
+    let is_localized = |photo: &PhotoLocalization| photo.verdict == Verdict::Localized;
+    let contradicts = |(a, b): (&PhotoLocalization, &PhotoLocalization)| {
+        let (Some(of_a), Some(of_b)) = (a.world_from_camera, b.world_from_camera) else { return false };
+        let sigma = |photo: &PhotoLocalization| {
+            photo.covariance.as_ref().map_or(f64::INFINITY, |covariance| standard_deviations(covariance).1)
+        };
+        let apart = (of_a.translation - of_b.translation).norm();
+        is_localized(a) && is_localized(b) && apart > MAX_APART * sigma(a).hypot(sigma(b))
+    };
+    let gains = pairs().any(|(a, b)| rank(b.verdict) > rank(a.verdict));
+    if !gains || pairs().any(contradicts) {
+        return first;
+    }
+    let mut best = second;
+    for (kept, other) in best.refined.iter_mut().zip(first.refined) {
+        if rank(other.verdict) >= rank(kept.verdict) {
+            *kept = other;
+        }
+    }
+    for (kept, other) in best.rigid.iter_mut().zip(first.rigid) {
+        if rank(other.verdict) >= rank(kept.verdict) {
+            *kept = other;
+        }
+    }
+    best
+}
+
+/// Distance in standard deviations of both at which two places of a photo contradict each other.
+const MAX_APART: f64 = 6.0;
+
+fn locate_by(
+    params: &CamsetParams,
+    scene: &Scene<'_>,
+    (photos, evidence): (&[QueryPhoto<'_>], &[&SingleLocalization]),
+    local_models: &[Reconstruction],
+    views: &Views,
+    seed: u64,
+) -> SetLocalization {
     let mut answer = SetLocalization::default();
     let mut rigid: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut refined: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut scene_links: Vec<usize> =
         evidence.iter().map(|e| e.photo.world_from_camera.map_or(0, |_| e.photo.inliers)).collect();
     let mut photo_links: BTreeMap<(usize, usize), usize> = BTreeMap::new();
-    for (number, model) in local_models.iter().enumerate() {
+    let by_themselves =
+        if views.matches.is_empty() { Vec::new() } else { left_alone(photos, evidence, local_models) };
+    for (number, model) in local_models.iter().chain(&by_themselves).enumerate() {
         let members: Vec<usize> =
             model.registered().map(ImageId::index).filter(|&photo| photo < photos.len()).collect();
-        if members.len() < 2 {
+        if members.len() < 2 && number < local_models.len() {
             continue;
         }
         for (pair, shared) in shared_points(model) {
             *photo_links.entry(pair).or_default() += shared;
         }
         let seed = seed.wrapping_add(0x1000 * (number as u64 + 1));
-        let component = Component { params, scene, photos, evidence, model, members: &members };
+        let component = Component { params, scene, photos, evidence, model, members: &members, views };
         match component.locate(seed) {
             ComponentAnswer::Localized(found) => {
                 answer.world_from_set.push(found.world_from_set);
@@ -63,11 +124,8 @@ pub fn locate_set(
                     scene_links[photo] = scene_links[photo].max(scene_points[slot]);
                 }
                 let names: Vec<&str> = members.iter().map(|&photo| photos[photo].name).collect();
-                answer.advice.push(format!(
-                    "the local model of {} is not localized: {}",
-                    names.join(", "),
-                    reasons.join("; ")
-                ));
+                let refusal = format!("{} is not localized: {}", called(&names), reasons.join("; "));
+                answer.advice.push(refusal);
             }
         }
     }
@@ -91,6 +149,42 @@ pub fn locate_set(
         }
     }
     answer
+}
+
+/// What photos that are placed together are called.
+fn called(names: &[&str]) -> String {
+    match names {
+        [name] => format!("{name} by itself"),
+        names => format!("the local model of {}", names.join(", ")),
+    }
+}
+
+/// Models of one photo, of those that no local model has and that are not localized alone.
+fn left_alone(
+    photos: &[QueryPhoto<'_>],
+    evidence: &[&SingleLocalization],
+    local_models: &[Reconstruction],
+) -> Vec<Reconstruction> {
+    let in_model = |photo: usize| {
+        let has = |model: &&Reconstruction| {
+            model.images.get(photo).is_some_and(|image| image.world_from_camera.is_some())
+        };
+        local_models.iter().filter(|model| model.registered().count() > 1).any(|model| has(&model))
+    };
+    let model = |photo: usize| {
+        let image = |(at, query): (usize, &QueryPhoto<'_>)| ReconstructionImage {
+            name: query.name.to_owned(),
+            camera: CameraId(0),
+            world_from_camera: (at == photo).then(Rigid::identity),
+        };
+        Reconstruction {
+            cameras: vec![photos[photo].camera.clone()],
+            images: photos.iter().enumerate().map(image).collect(),
+            ..Reconstruction::default()
+        }
+    };
+    let alone = |photo: &usize| evidence[*photo].photo.verdict != Verdict::Localized && !in_model(*photo);
+    (0..photos.len()).filter(alone).map(model).collect()
 }
 
 /// Number of local points that tie each pair of photos, by image ids in ascending order.
@@ -176,7 +270,15 @@ mod tests {
     ) -> SetLocalization {
         let alone = photos.iter().map(|photo| locate_single(&SingleParams::default(), scene, photo, seed));
         let alone: Vec<SingleLocalization> = alone.collect();
-        locate_set(params, scene, photos, &alone.iter().collect::<Vec<_>>(), local_models, seed)
+        locate_set(
+            params,
+            scene,
+            photos,
+            &alone.iter().collect::<Vec<_>>(),
+            local_models,
+            Views::default,
+            seed,
+        )
     }
 
     fn locate(world: &World, params: &CamsetParams) -> SetLocalization {
@@ -205,6 +307,117 @@ mod tests {
         assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
         let target = &found.paths[8];
         assert!(target.links.len() > 2 && target.weakest().is_some_and(|link| link.shared >= 12));
+    }
+
+    /// A set whose scene has no point that any of its photos shows.
+    fn locate_by_views(panoramas: &[u32], seed: u64) -> (World, SetLocalization) {
+        let mut world = World::chain(6, 0.2, seed);
+        world.forget_seen_points();
+        let alone = |photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7);
+        let alone: Vec<SingleLocalization> = world.queries().iter().map(alone).collect();
+        let found = locate_set(
+            &CamsetParams::default(),
+            &world.scene(),
+            &world.queries(),
+            &alone.iter().collect::<Vec<_>>(),
+            std::slice::from_ref(&world.local),
+            || world.views(panoramas),
+            7,
+        );
+        (world, found)
+    }
+
+    #[test]
+    fn a_set_that_shares_no_scene_point_is_placed_by_what_panoramas_show() {
+        for seed in [1, 2, 3] {
+            let (world, found) = locate_by_views(&[5, 7], seed);
+            for photo in &found.refined {
+                assert_eq!(photo.verdict, Verdict::Localized, "{photo:#?}");
+            }
+            let (center, rotation) = worst_errors(&world, &found.refined);
+            assert!(center < 0.15 && rotation < 0.2, "{seed}: {center} {rotation}");
+            assert!(found.paths[5].weakest().is_some_and(|link| link.shared >= 12), "{:?}", found.paths[5]);
+        }
+    }
+
+    #[test]
+    fn one_panorama_gives_a_set_no_scale() {
+        let (_, found) = locate_by_views(&[6], 1);
+        for photo in &found.refined {
+            assert_ne!(photo.verdict, Verdict::Localized, "{photo:#?}");
+        }
+        let (_, found) = locate_by_views(&[], 1);
+        assert!(found.refined.iter().all(|photo| photo.world_from_camera.is_none()));
+    }
+
+    #[test]
+    fn one_photo_is_placed_by_two_panoramas_that_share_no_point() {
+        for seed in [1, 2, 3] {
+            let mut world = World::chain(1, 0.2, seed);
+            world.forget_seen_points();
+            let alone = locate_single(&SingleParams::default(), &world.scene(), &world.queries()[0], 7);
+            assert_ne!(alone.photo.verdict, Verdict::Localized);
+            let locate = |panoramas: &[u32]| {
+                let views = || world.views(panoramas);
+                let params = CamsetParams::default();
+                locate_set(&params, &world.scene(), &world.queries(), &[&alone], &[], views, 7)
+            };
+            let found = locate(&[5, 7]);
+            assert_eq!(found.refined[0].verdict, Verdict::Localized, "{:#?}", found.refined[0]);
+            let (center, rotation) = worst_errors(&world, &found.refined);
+            assert!(center < 0.1 && rotation < 0.2, "{seed}: {center} {rotation}");
+            let found = locate(&[6]);
+            assert_ne!(found.refined[0].verdict, Verdict::Localized, "{:#?}", found.refined[0]);
+        }
+    }
+
+    #[test]
+    fn views_of_another_place_localize_nothing() {
+        let mut world = World::chain_in(&Place::street(3500, 21), 6, 0.2, 21);
+        let other = World::chain_in(&Place::street(3500, 21).shuffled(4), 6, 0.2, 21);
+        world.photos = other.photos;
+        world.local = other.local;
+        world.forget_seen_points();
+        let alone = |photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7);
+        let alone: Vec<SingleLocalization> = world.queries().iter().map(alone).collect();
+        let alone: Vec<&SingleLocalization> = alone.iter().collect();
+        for models in [vec![world.local.clone()], Vec::new()] {
+            let views = || world.views(&[4, 5, 6, 7]);
+            let params = CamsetParams::default();
+            let found = locate_set(&params, &world.scene(), &world.queries(), &alone, &models, views, 7);
+            for photo in &found.refined {
+                assert_ne!(photo.verdict, Verdict::Localized, "{photo:#?}");
+            }
+        }
+    }
+
+    #[test]
+    fn answers_that_contradict_each_other_are_not_mixed() {
+        let photo = |verdict, x: f64| PhotoLocalization {
+            name: String::new(),
+            camera: crate::test_scene::pinhole(),
+            world_from_camera: Some(Rigid::new(UnitQuaternion::identity(), Vector3::new(x, 0.0, 0.0))),
+            covariance: Some(nalgebra::Matrix6::identity() * 1e-4),
+            inliers: 20,
+            verdict,
+            reasons: Vec::new(),
+        };
+        let answer = |photos: Vec<PhotoLocalization>| SetLocalization {
+            rigid: photos.clone(),
+            refined: photos,
+            ..SetLocalization::default()
+        };
+        let verdicts =
+            |found: &SetLocalization| found.refined.iter().map(|photo| photo.verdict).collect::<Vec<_>>();
+        let first = || answer(vec![photo(Verdict::Localized, 0.0), photo(Verdict::Uncertain, 1.0)]);
+        let agreeing = answer(vec![photo(Verdict::Uncertain, 0.01), photo(Verdict::Localized, 1.01)]);
+        let best = better_of(first(), agreeing);
+        assert_eq!(verdicts(&best), [Verdict::Localized; 2]);
+        assert_eq!(best.refined[0].world_from_camera, first().refined[0].world_from_camera);
+        let elsewhere = answer(vec![photo(Verdict::Localized, 5.0), photo(Verdict::Localized, 6.0)]);
+        assert_eq!(better_of(first(), elsewhere), first());
+        let poorer = answer(vec![photo(Verdict::Uncertain, 0.0), photo(Verdict::NotLocalized, 1.0)]);
+        assert_eq!(better_of(first(), poorer), first());
     }
 
     #[test]

@@ -118,7 +118,7 @@ fn solve(
         points: Vec::new(),
         lengths: Vec::new(),
     };
-    refine(&mut model, scene.index, photo, matches, params.max_error_sigmas, false);
+    refine(&mut model, scene, photo, matches, params.max_error_sigmas, false);
     let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
     let agreeing = inliers(&rays, scene.index, &pose, matches, params.max_error_sigmas);
@@ -154,7 +154,7 @@ fn solve(
     {
         model.photos[0].world_from_camera = other;
     }
-    let covariance = refine(&mut model, scene.index, photo, &candidates, params.max_error_sigmas, true);
+    let covariance = refine(&mut model, scene, photo, &candidates, params.max_error_sigmas, true);
     let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
     let inliers = inliers(&rays, scene.index, &pose, &candidates, params.max_error_sigmas);
@@ -164,12 +164,13 @@ fn solve(
 /// Refines the one photo of `model` on the matches that agree with it, twice, so that new inliers join.
 fn refine(
     model: &mut JointModel,
-    index: &SceneIndex,
+    scene: &Scene<'_>,
     photo: &QueryPhoto<'_>,
     matches: &[SceneMatch],
     max_error_sigmas: f64,
     with_covariance: bool,
 ) -> Option<Matrix6<f64>> {
+    let index = scene.index;
     let mut covariance = None;
     for last in [false, true] {
         let camera = model.cameras[0].clone();
@@ -179,7 +180,7 @@ fn refine(
             return None;
         }
         let seen = JointObservations { direct: vec![agreeing], ..JointObservations::default() };
-        let covariances = refine_jointly(model, index, &[rays], &seen, last && with_covariance);
+        let covariances = refine_jointly(model, scene, &[rays], &seen, last && with_covariance);
         covariance = covariances.into_iter().next().flatten();
     }
     covariance

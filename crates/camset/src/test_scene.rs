@@ -1,17 +1,19 @@
 //! A street with truth: panoramas at its beginning, a chain of photos that leads away from them.
 
+use std::collections::BTreeSet;
+
 use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
+use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, MatchParams};
 use setloc_index::{IndexParams, SceneIndex};
 use setloc_sfm::synthetic::normal;
 use setloc_sfm::{
     AlignedTrack, BaselineLength, CameraId, ImageId, Observation, PointId, Reconstruction,
-    ReconstructionImage, ReconstructionPoint, Rigid, Similarity,
+    ReconstructionImage, ReconstructionPoint, Rigid, Similarity, TwoViewParams,
 };
 
-use crate::{QueryPhoto, Scene, SceneMatch};
+use crate::{QueryPhoto, Scene, SceneMatch, Views, match_views};
 
 const NOISE_PX: f64 = 0.5;
 const VISIBLE: f64 = 35.0;
@@ -299,6 +301,29 @@ impl World {
         }
         let features: Vec<&ImageFeatures> = self.panoramas.iter().map(|view| &view.features).collect();
         self.index = SceneIndex::build(&IndexParams::default(), &self.scene_model, &features);
+    }
+
+    /// Leaves the scene none of the points that a photo shows, as where panoramas stand too far apart to share them.
+    pub(crate) fn forget_seen_points(&mut self) {
+        let seen: BTreeSet<usize> =
+            self.photos.iter().flat_map(|photo| photo.shows.iter().flatten().copied()).collect();
+        let keep: Vec<bool> = self.scene_points.iter().map(|point| !seen.contains(point)).collect();
+        let mut kept = keep.iter();
+        self.scene_points.retain(|_| *kept.next().unwrap());
+        let mut kept = keep.iter();
+        self.scene_model.points.retain(|_| *kept.next().unwrap());
+        let features: Vec<&ImageFeatures> = self.panoramas.iter().map(|view| &view.features).collect();
+        self.index = SceneIndex::build(&IndexParams::default(), &self.scene_model, &features);
+    }
+
+    /// What the photos share with some of the panoramas.
+    pub(crate) fn views(&self, panoramas: &[u32]) -> Views {
+        let features = (0..)
+            .zip(&self.panoramas)
+            .map(|(image, view)| panoramas.contains(&image).then(|| view.features.clone()));
+        let likely: Vec<ImageId> = panoramas.iter().copied().map(ImageId).collect();
+        let params = (&MatchParams::default(), &TwoViewParams::default());
+        match_views(params, &self.scene(), features.collect(), &likely, &self.queries(), 5)
     }
 
     /// Makes the scene's points exact: without noise in the panoramas, the index gives them no covariance.

@@ -85,6 +85,22 @@ impl ImageFeatures {
         self.simulated.first().map_or(self.len(), |view| (view.start as usize).min(self.len()))
     }
 
+    /// The strongest keypoints of the image itself: up to so many brighter than their surround, and as many darker.
+    #[must_use]
+    pub fn strongest(&self, of_each: usize) -> Self {
+        let [bright, dark] = self.parts().map(|part| part.start..part.end.min(part.start + of_each));
+        let kept = || bright.clone().chain(dark.clone());
+        Self {
+            width: self.width,
+            height: self.height,
+            keypoints: kept().map(|index| self.keypoints[index]).collect(),
+            light: bright.len() as u32,
+            simulated: Vec::new(),
+            descriptors: kept().flat_map(|index| self.descriptor(index)).copied().collect(),
+            colors: kept().filter_map(|index| self.colors.get(index)).copied().collect(),
+        }
+    }
+
     /// The indices of the image's own keypoints that are brighter than their surround, and of those darker.
     pub fn parts(&self) -> [Range<usize>; 2] {
         let own = self.own_len();
@@ -144,4 +160,29 @@ pub struct Rays {
     pub bearings: Vec<Vector3<f64>>,
     /// Angular standard deviation of each bearing in radians.
     pub sigmas: Vec<f64>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_strongest_are_the_first_of_either_kind() {
+        let keypoint = |x: f32| Keypoint { x, y: 1.0, size: 3.0, orientation: 0.0, noise_px: 0.1 };
+        let features = ImageFeatures {
+            width: 10,
+            height: 8,
+            keypoints: (0..7_u8).map(|at| keypoint(f32::from(at))).collect(),
+            light: 3,
+            simulated: vec![SimulatedView { start: 6, light: 1 }],
+            descriptors: (0..7).flat_map(|at| [at; DESCRIPTOR_LEN]).collect(),
+            colors: (0..7).map(|at| [at; 3]).collect(),
+        };
+        let strongest = features.strongest(2);
+        let places: Vec<f32> = strongest.keypoints.iter().map(|keypoint| keypoint.x).collect();
+        assert_eq!(places, [0.0, 1.0, 3.0, 4.0]);
+        assert_eq!((strongest.light, strongest.colors[2], strongest.descriptor(3)[0]), (2, [3; 3], 4));
+        assert!(strongest.simulated.is_empty());
+        assert_eq!(features.strongest(9).len(), 6, "views of other tilts are no own keypoints");
+    }
 }

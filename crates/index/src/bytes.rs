@@ -1,15 +1,24 @@
-//! Bytes for serde as one block: as a sequence of numbers, which a `Vec<u8>` is to it, each costs a call.
+//! Bytes for serde as one block (`#[serde(with = "setloc_index::bytes")]`): as a sequence of numbers, which a `Vec<u8>`
+//! is to it, each costs a call.
 
 use std::fmt;
 
 use serde::de::{SeqAccess, Visitor};
 use serde::{Deserializer, Serializer};
 
-pub(crate) fn serialize<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
+/// Writes one block.
+///
+/// # Errors
+/// Those of the format.
+pub fn serialize<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_bytes(bytes)
 }
 
-pub(crate) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<u8>, D::Error> {
+/// Reads one block.
+///
+/// # Errors
+/// Those of the format.
+pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<u8>, D::Error> {
     deserializer.deserialize_byte_buf(Block)
 }
 

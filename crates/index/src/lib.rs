@@ -8,7 +8,7 @@
 //! The index is self-contained: it holds positions, covisibility and what guided matching needs of every
 //! observation, so no features and no reconstruction have to be kept beside it. It knows no poses of queries.
 
-mod bytes;
+pub mod bytes;
 mod kernel;
 mod matching;
 mod nearest;

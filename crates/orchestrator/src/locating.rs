@@ -84,7 +84,7 @@ pub fn locate(
     let found =
         located.single.iter().any(|photo| photo.name == target && photo.verdict == Verdict::Localized);
     let wanted = matches!(mode, Mode::Set | Mode::Both) || (mode == Mode::Auto && !found);
-    if wanted && folder.images.len() > 1 {
+    if wanted {
         whole.absorb(run(session, folder, what, (name, target), (mode == Mode::Both, true), &mut located)?);
     }
     session.remember(name, &whole)?;

@@ -4,11 +4,11 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
-use setloc_features::Wgs84;
+use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::Reconstruction;
+use setloc_sfm::{ImageId, Reconstruction};
 
-use crate::codec;
+use crate::codec::{self, Artifact};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
 use crate::serde_artifact;
@@ -20,6 +20,9 @@ pub struct SceneFile {
     pub components: Vec<Reconstruction>,
     /// Searchable descriptors of the first component.
     pub index: SceneIndex,
+    /// Features of the first component's images, by image id, as artifacts; empty where an image is not registered.
+    /// Photos that share too little with the points are matched with them ([`SceneFile::features_of`]).
+    pub features: Vec<Block>,
     /// WGS84 place of the world's origin, when positions were given.
     pub origin: Option<Wgs84>,
     /// What the mapper found worth saying.
@@ -32,9 +35,25 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 7);
+serde_artifact!(SceneFile, "scene", 8);
+
+/// Bytes that are stored as one block.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Block(#[serde(with = "setloc_index::bytes")] pub Vec<u8>);
 
 impl SceneFile {
+    /// The features of an image of the first component; `None` where it is not registered.
+    ///
+    /// # Errors
+    /// When the file is damaged.
+    pub fn features_of(&self, image: ImageId) -> Result<Option<ImageFeatures>> {
+        let Some(block) = self.features.get(image.index()).filter(|block| !block.0.is_empty()) else {
+            return Ok(None);
+        };
+        let features = ImageFeatures::from_payload(&block.0);
+        Ok(Some(features.with_context(|| format!("features of image {} of the scene", image.0))?))
+    }
+
     /// Reads a scene file.
     ///
     /// # Errors
@@ -50,5 +69,26 @@ impl SceneFile {
     /// The largest component.
     pub fn main(&self) -> Option<&Reconstruction> {
         self.components.first()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn features_are_read_image_by_image_and_damage_is_said() {
+        let features = ImageFeatures { width: 20, height: 10, ..ImageFeatures::default() };
+        let mut block = Block::default();
+        features.write_payload(&mut block.0).unwrap();
+        let damaged = Block(block.0[..10].to_vec());
+        let scene = SceneFile { features: vec![Block::default(), block, damaged], ..SceneFile::default() };
+        let bytes = codec::encode(&scene).unwrap();
+        let scene: SceneFile = codec::decode(&bytes).unwrap();
+        assert_eq!(scene.features_of(ImageId(0)).unwrap(), None);
+        assert_eq!(scene.features_of(ImageId(1)).unwrap(), Some(features));
+        let error = scene.features_of(ImageId(2)).unwrap_err();
+        assert!(error.to_string().contains("image 2 of the scene"), "{error:#}");
+        assert_eq!(scene.features_of(ImageId(3)).unwrap(), None);
     }
 }

@@ -2,20 +2,25 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{Matrix3, Matrix6};
+use nalgebra::{Matrix3, Matrix6, Vector3};
 use rayon::prelude::*;
 use setloc_features::{Camera, Keypoint};
 use setloc_sfm::{BaselineLength, ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
 
+use super::called;
 use super::correspondences::{SetCorrespondence, correspondences, set_rays};
 use super::rigid::{RigidPose, SetPhotos, rigid_pose};
+use super::sights::{SetView, Sights};
 use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
 use crate::guided::guided_matches;
-use crate::refine::{JointModel, JointObservations, JointPhoto, Sighting, TiedPoint, refine_jointly};
+use crate::refine::{
+    JointModel, JointObservations, JointPhoto, SceneView, Sighting, TiedPoint, refine_jointly,
+};
 use crate::single::{inliers, union};
 use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
 use crate::{
-    CamsetParams, GuidedParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, Verdict,
+    CamsetParams, GuidedParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization,
+    Verdict, Views,
 };
 
 /// Correspondences in a minimal sample of the generalized pose with scale.
@@ -57,6 +62,8 @@ pub(crate) struct Component<'a> {
     pub model: &'a Reconstruction,
     /// Photo indices by slot, ascending.
     pub members: &'a [usize],
+    /// What the photos share with images of the scene beside its points.
+    pub views: &'a Views,
 }
 
 /// The joint refinement's result.
@@ -64,6 +71,14 @@ struct Joint {
     model: JointModel,
     /// Scene points that each photo sees itself, within the inlier bound.
     direct: Vec<Vec<SceneMatch>>,
+    /// Images of the scene that show a local point of each photo, counted by the point, within the inlier bound.
+    viewed: Vec<usize>,
+    /// How many of all these are of other images than the one with most.
+    viewed_from_elsewhere: usize,
+    /// Sights of the rigid pose that still agree.
+    kept_sights: usize,
+    /// Where lone rays of each photo and of images of the scene meet.
+    met: Vec<Vec<Vector3<f64>>>,
     covariances: Vec<Option<Matrix6<f64>>>,
 }
 
@@ -205,37 +220,43 @@ impl Component<'_> {
         let set_rays = set_rays(params, self.scene.index, &set_from_camera, &rays, &candidates);
         let photos =
             SetPhotos { set_from_camera: &set_from_camera, members: self.members, evidence: self.evidence };
-        let rigid = rigid_pose(params, &candidates, self.model, &set_rays, &photos, seed);
+        let sights = self.sights(&set_from_camera, &rays);
+        let rigid = rigid_pose(params, &candidates, self.model, (&set_rays, &sights), &photos, seed);
         let Some(rigid) = rigid else {
             let reasons =
                 vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];
             return ComponentAnswer::Refused { reasons, scene_points };
         };
         let mut reasons = Vec::new();
-        let mut evidence = self.support(&rays, &set_from_camera, &candidates, &rigid);
+        let mut evidence = self.support(&rays, &set_from_camera, &candidates, &sights, &rigid);
         if evidence.inliers < params.verdict.min_inliers {
             judge_support(&params.verdict, &evidence, &mut reasons);
             return ComponentAnswer::Refused { reasons, scene_points };
         }
-        let mut joint = self.refine_jointly(&set_from_camera, &candidates, &rigid);
+        let mut joint = self.refine_jointly(&set_from_camera, &candidates, &sights, &rigid);
         self.follow_pairs(&mut joint);
         evidence.log10_false_alarms = evidence.log10_false_alarms.min(self.joint_false_alarms(&joint));
         let mut support = judge_support(&params.verdict, &evidence, &mut reasons);
-        let elsewhere = seen_from_elsewhere(&set_from_camera, &candidates, &rigid.agreeing);
+        let elsewhere = seen_from_elsewhere(&set_from_camera, &candidates, &rigid.agreeing)
+            .max(sights.seen_from_elsewhere(&rigid.sights, &rigid.lone));
         // One standpoint's matches place that standpoint; a few chance matches of the others then fit some scale.
-        if elsewhere < params.verdict.min_inliers / 2 {
+        let has_scale = self.members.len() > 1;
+        if has_scale && elsewhere < params.verdict.min_inliers / 2 {
             reasons.push(format!("its scale rests on {elsewhere} matches seen from elsewhere than the rest"));
             support = weaker(support, Verdict::Uncertain);
         }
         let mut refined = self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
         let mut without_scale = Vec::new();
-        if elsewhere.max(joint.seen_from_elsewhere()) < MIN_FOR_SCALE {
+        if has_scale
+            && elsewhere.max(joint.seen_from_elsewhere()).max(joint.viewed_from_elsewhere) < MIN_FOR_SCALE
+        {
             without_scale = joint.away_from_main();
             for &slot in &without_scale {
                 refuse_without_scale(&mut refined[slot]);
             }
         }
-        let undetermined = rigid.observability.undetermined();
+        let mut undetermined = rigid.observability.undetermined();
+        undetermined.retain(|direction| has_scale || *direction != "scale");
         let mut rigid_support = support;
         if !undetermined.is_empty() {
             reasons.push(format!(
@@ -245,7 +266,7 @@ impl Component<'_> {
             rigid_support = Verdict::Uncertain;
         }
         let names: Vec<&str> = self.members.iter().map(|&photo| self.photos[photo].name).collect();
-        let mut remarks = vec![format!("the local model of {}: {}", names.join(", "), reasons.join("; "))];
+        let mut remarks = vec![format!("{}: {}", called(&names), reasons.join("; "))];
         remarks.extend(self.lengths().map(|(slots, length)| self.basis(slots, &length)));
         let mut rigid_answers =
             self.rigid_answers(&set_from_camera, &candidates, &rigid, rigid_support, &reasons);
@@ -259,7 +280,12 @@ impl Component<'_> {
         ComponentAnswer::Localized(Box::new(ComponentPoses {
             world_from_set: rigid.world_from_set,
             rigid: rigid_answers,
-            scene_points: joint.direct.iter().map(Vec::len).collect(),
+            scene_points: joint
+                .direct
+                .iter()
+                .zip(&joint.viewed)
+                .map(|(direct, viewed)| direct.len() + viewed)
+                .collect(),
             refined,
             remarks,
         }))
@@ -352,12 +378,25 @@ impl Component<'_> {
             .collect()
     }
 
+    /// What images of the scene show of the local points.
+    fn sights(&self, set_from_camera: &[Rigid], rays: &[PhotoRays<'_>]) -> Sights {
+        if self.views.matches.is_empty() {
+            return Sights::default();
+        }
+        let tracks: Vec<_> = (0..self.model.points.len()).map(|local| self.track(local)).collect();
+        let positions: Vec<_> = self.model.points.iter().map(|point| point.position).collect();
+        let set = SetView { set_from_camera, rays, tracks: &tracks, positions: &positions };
+        let slot_of = |photo: usize| self.members.binary_search(&photo).ok();
+        Sights::new(self.params, self.scene, self.views, &set, slot_of)
+    }
+
     /// What supports the rigid pose, photos taken together.
     fn support(
         &self,
         rays: &[PhotoRays<'_>],
         set_from_camera: &[Rigid],
         candidates: &[SetCorrespondence],
+        sights: &Sights,
         rigid: &RigidPose,
     ) -> Evidence {
         let mut by_slot: Vec<Vec<SceneMatch>> = vec![Vec::new(); self.members.len()];
@@ -382,11 +421,38 @@ impl Component<'_> {
         }
         let inliers = rigid.agreeing.len();
         let chance = if total > 0 { chance / total as f64 } else { 1.0 };
+        let by_rays = log10_false_alarms(candidates.len(), inliers, SAMPLE, chance);
+        let by_sights = sights.log10_false_alarms(
+            &rigid.sights,
+            &rigid.world_from_set,
+            self.params.max_error_sigmas,
+            SAMPLE,
+        );
+        let by_lone = sights.lone_log10_false_alarms(&rigid.lone, self.params.max_error_sigmas);
+        // A set's pose that its points do not support is none, however many lone rays happen to meet.
+        let of_lone = |lone| if self.members.len() > 1 { 0 } else { Sights::worth_of_lone(lone) };
+        // A local point that either has shown right counts once.
+        let mut points = sights.points(&rigid.sights);
+        points.retain(|point| rigid.agreeing.iter().all(|&number| candidates[number].local != Some(*point)));
+        let mut sighted = sights.all_points();
+        sighted.retain(|point| candidates.iter().all(|candidate| candidate.local != Some(*point)));
+        let mut shown: BTreeMap<usize, Vec<u32>> = BTreeMap::new();
+        for &at in &rigid.sights {
+            for &(slot, feature) in &sights.all[at].photos {
+                shown.entry(slot).or_default().push(feature);
+            }
+        }
+        for lone in rigid.lone.iter().map(|&at| &sights.lone[at]) {
+            shown.entry(lone.slot).or_default().push(lone.feature);
+        }
+        for (slot, features) in shown {
+            cells = cells.max(occupied_cells(&rays[slot], features.into_iter()));
+        }
         Evidence {
-            matches: candidates.len(),
-            inliers,
+            matches: candidates.len() + sighted.len() + of_lone(sights.lone.len()),
+            inliers: inliers + points.len() + of_lone(rigid.lone.len()),
             sample: SAMPLE,
-            log10_false_alarms: log10_false_alarms(candidates.len(), inliers, SAMPLE, chance),
+            log10_false_alarms: by_rays.min(by_sights).min(by_lone),
             cells,
             runner_up: rigid.runner_up,
         }
@@ -417,6 +483,7 @@ impl Component<'_> {
         &self,
         set_from_camera: &[Rigid],
         candidates: &[SetCorrespondence],
+        sights: &Sights,
         rigid: &RigidPose,
     ) -> Joint {
         let world_from_set = &rigid.world_from_set;
@@ -444,19 +511,87 @@ impl Component<'_> {
         for round in 0..=self.params.rounds {
             let cameras = model.cameras.clone();
             let rays = self.rays(&cameras);
-            let observations = if round == 0 {
+            let mut observations = if round == 0 {
                 self.rigid_observations(candidates, rigid)
             } else {
                 let steps = (self.params.rounds - round).min(WIDENING.len() - 1);
                 let widening = WIDENING[WIDENING.len() - 1 - steps];
                 self.observations(&model, &rays, candidates, world_from_set, widening)
             };
+            let agreeing =
+                if round == 0 { rigid.sights.clone() } else { self.agreeing_sights(sights, &model) };
+            observations.views = free_views(sights, &agreeing, &observations.tracks);
+            let local_points = model.points.len();
+            self.add_lone(sights, &mut model, &rays, &mut observations);
             let last = round == self.params.rounds;
-            covariances = refine_jointly(&mut model, self.scene.index, &rays, &observations, last);
+            covariances = refine_jointly(&mut model, self.scene, &rays, &observations, last);
+            model.points.truncate(local_points);
         }
         let rays = self.rays(&model.cameras);
         let direct = self.observations(&model, &rays, candidates, world_from_set, 1.0).direct;
-        Joint { model, direct, covariances }
+        let agreeing = self.agreeing_sights(sights, &model);
+        let mut viewed = vec![0; self.members.len()];
+        for &at in &agreeing {
+            for &(slot, _) in &sights.all[at].photos {
+                viewed[slot] += 1;
+            }
+        }
+        let bound = self.params.max_error_sigmas;
+        let (mut met, mut meeting) = (vec![Vec::new(); self.members.len()], Vec::new());
+        for (at, lone) in sights.lone.iter().enumerate() {
+            let pose = &model.photos[lone.slot].world_from_camera;
+            if let Some(point) = lone.meeting_point(&rays[lone.slot], pose, bound) {
+                met[lone.slot].push(point);
+                meeting.push(at);
+            }
+        }
+        for (viewed, met) in viewed.iter_mut().zip(&met) {
+            *viewed += Sights::worth_of_lone(met.len());
+        }
+        let viewed_from_elsewhere = sights.seen_from_elsewhere(&agreeing, &meeting);
+        let kept = |of: &[usize], now: &[usize]| of.iter().filter(|at| now.binary_search(at).is_ok()).count();
+        let kept_sights = kept(&rigid.sights, &agreeing) + kept(&rigid.lone, &meeting);
+        Joint { model, direct, viewed, viewed_from_elsewhere, kept_sights, met, covariances }
+    }
+
+    /// Adds what photos and images of the scene show alike beside the local points: points of their own, where the
+    /// rays meet.
+    fn add_lone(
+        &self,
+        sights: &Sights,
+        model: &mut JointModel,
+        rays: &[PhotoRays<'_>],
+        observations: &mut JointObservations,
+    ) {
+        let mut point_of: BTreeMap<(usize, u32), usize> = BTreeMap::new();
+        for lone in &sights.lone {
+            let key = (lone.slot, lone.feature);
+            let pose = &model.photos[lone.slot].world_from_camera;
+            let meeting = lone.meeting_point(&rays[lone.slot], pose, self.params.max_error_sigmas);
+            let Some(position) = meeting else { continue };
+            let point = *point_of.entry(key).or_insert_with(|| {
+                let place = rays[lone.slot].place_of(lone.feature);
+                let sighting = Sighting {
+                    photo: lone.slot,
+                    feature: Some(lone.feature),
+                    place,
+                    keypoint_noise_px: place.noise_px,
+                };
+                observations.tracks.push((model.points.len(), sighting));
+                model.points.push(position);
+                model.points.len() - 1
+            });
+            observations.views.push((point, SceneView { image: lone.seen.image, place: lone.place }));
+        }
+    }
+
+    /// The sights whose rays pass by the local points where these are now.
+    fn agreeing_sights(&self, sights: &Sights, model: &JointModel) -> Vec<usize> {
+        let agrees = |at: &usize| {
+            let sight = &sights.all[*at];
+            sight.error_sigmas_of(&model.points[sight.local]) < self.params.max_error_sigmas
+        };
+        (0..sights.all.len()).filter(agrees).collect()
     }
 
     /// A camera is known when all photos that share it say so.
@@ -482,7 +617,7 @@ impl Component<'_> {
             }
         }
         let direct = direct.into_iter().map(unique).collect();
-        JointObservations { direct, tied, tracks: self.free_tracks(&locals) }
+        JointObservations { direct, tied, tracks: self.free_tracks(&locals), views: Vec::new() }
     }
 
     /// A local point as a scene point with all its sightings, where it is aligned.
@@ -580,7 +715,7 @@ impl Component<'_> {
             direct[slot] = unique(union(&direct[slot], &agreeing));
         }
         let tracks = agreeing_tracks(model, rays, self.free_tracks(&locals), bound);
-        JointObservations { direct, tied, tracks }
+        JointObservations { direct, tied, tracks, views: Vec::new() }
     }
 
     /// Slots and features that see a local point.
@@ -690,7 +825,8 @@ impl Component<'_> {
             };
             candidate.seen_by.iter().any(seen)
         });
-        let kept = kept.count() as f64 / rigid.agreeing.len().max(1) as f64;
+        let supporting = rigid.agreeing.len() + rigid.sights.len() + rigid.lone.len();
+        let kept = (kept.count() + joint.kept_sights) as f64 / supporting.max(1) as f64;
         (0..self.members.len())
             .map(|slot| {
                 let photo = self.members[slot];
@@ -730,7 +866,7 @@ impl Component<'_> {
                     camera: joint.model.cameras[self.camera_of(slot)].clone(),
                     world_from_camera: Some(pose),
                     covariance,
-                    inliers: joint.direct[slot].len(),
+                    inliers: joint.direct[slot].len() + joint.viewed[slot],
                     verdict,
                     reasons,
                 }
@@ -760,7 +896,9 @@ impl Component<'_> {
             median(seen.map(|m| (self.scene.index.position(m.point) - center).norm()).collect())
         };
         let beside = |other: &usize| photos[*other].standpoint == photos[slot].standpoint;
+        let to_met = || median(joint.met[slot].iter().map(|point| (point - center).norm()).collect());
         to_scene(&mut std::iter::once(slot))
+            .or_else(to_met)
             .or_else(|| to_scene(&mut (0..photos.len()).filter(beside)))
             .or_else(|| {
                 let sees = |local: &usize| self.track(*local).iter().any(|&(seer, _)| seer == slot);
@@ -769,6 +907,17 @@ impl Component<'_> {
             })
             .unwrap_or(0.0)
     }
+}
+
+/// Those of some sights whose local points are free.
+fn free_views(sights: &Sights, agreeing: &[usize], tracks: &[(usize, Sighting)]) -> Vec<(usize, SceneView)> {
+    let free: BTreeSet<usize> = tracks.iter().map(|(local, _)| *local).collect();
+    let view = |&at: &usize| {
+        let sight = &sights.all[at];
+        let view = SceneView { image: sight.seen.image, place: sight.place };
+        free.contains(&sight.local).then_some((sight.local, view))
+    };
+    agreeing.iter().filter_map(view).collect()
 }
 
 /// The observations that agree with the present poses and local points; points seen once only are left out.
@@ -824,7 +973,7 @@ fn seen_from_elsewhere(
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{UnitQuaternion, Vector3};
+    use nalgebra::UnitQuaternion;
     use setloc_sfm::PointId;
 
     use super::*;

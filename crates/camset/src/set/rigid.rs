@@ -9,6 +9,7 @@ use setloc_sfm::solvers::triangulation::length_along;
 use setloc_sfm::{ImageId, Reconstruction, ReconstructionPoint, Rigid, Similarity};
 
 use super::correspondences::{SetCorrespondence, SetRays};
+use super::sights::Sights;
 use crate::evidence::{median, same_pose};
 use crate::observability::{Observability, observability, refine_similarity};
 use crate::{CamsetMethod, CamsetParams, SingleLocalization, Verdict};
@@ -18,7 +19,11 @@ pub(crate) struct RigidPose {
     pub world_from_set: Similarity,
     /// Agreeing correspondences, ascending.
     pub agreeing: Vec<usize>,
-    /// Correspondences that agree with the best other pose.
+    /// Agreeing sights, ascending.
+    pub sights: Vec<usize>,
+    /// Agreeing lone sights, ascending.
+    pub lone: Vec<usize>,
+    /// Correspondences, or local points that the scene's images see, that agree with the best other pose.
     pub runner_up: usize,
     pub observability: Observability,
 }
@@ -36,7 +41,7 @@ pub(crate) fn rigid_pose(
     params: &CamsetParams,
     correspondences: &[SetCorrespondence],
     model: &Reconstruction,
-    rays: &SetRays,
+    (rays, sights): (&SetRays, &Sights),
     photos: &SetPhotos<'_>,
     seed: u64,
 ) -> Option<RigidPose> {
@@ -44,6 +49,7 @@ pub(crate) fn rigid_pose(
     let count = correspondences.len();
     let mut candidates: Vec<Similarity> = estimate(params, rays, seed).into_iter().collect();
     candidates.extend(alignments(set_from_camera, members, evidence));
+    candidates.extend(sights.estimate(params, &[], &rays.rays, seed));
     for (slot, &photo) in members.iter().enumerate() {
         let in_set = &set_from_camera[slot];
         let alone = evidence[photo]
@@ -63,7 +69,8 @@ pub(crate) fn rigid_pose(
             candidates.extend(rays.with_baselines(params, &axes_at_photo, &in_set.translation));
         }
     }
-    let score = |pose: &Similarity| rays.score(pose, params.max_error_sigmas, count);
+    let bound = params.max_error_sigmas;
+    let score = |pose: &Similarity| rays.score(pose, bound, count) + sights.score(pose, bound);
     let mut best: Option<(Similarity, f64)> = None;
     for candidate in candidates {
         let value = score(&candidate);
@@ -81,9 +88,20 @@ pub(crate) fn rigid_pose(
         keep[correspondence] = false;
         inlier[correspondence] = true;
     }
-    let runner_up = runner_up(params, &rays.subset(&keep), &world_from_set, set_from_camera, count, seed);
+    let agreeing_sights = sights.agreeing(&world_from_set, bound);
+    let by_rays = runner_up(params, &rays.subset(&keep), &world_from_set, set_from_camera, count, seed);
+    let lone = sights.agreeing_lone(&world_from_set, bound);
+    let by_sights =
+        rival_of_sights(params, sights, (&agreeing_sights, &lone), &world_from_set, set_from_camera, seed);
     let observability = observability(&world_from_set, &rays.subset(&inlier).rays);
-    Some(RigidPose { world_from_set, agreeing, runner_up, observability })
+    Some(RigidPose {
+        world_from_set,
+        agreeing,
+        sights: agreeing_sights,
+        lone,
+        runner_up: by_rays.max(by_sights),
+        observability,
+    })
 }
 
 fn estimate(params: &CamsetParams, rays: &SetRays, seed: u64) -> Option<Similarity> {
@@ -255,6 +273,31 @@ fn runner_up(
         .iter()
         .any(|camera| !same_pose(&pose.transform_pose(camera), &best.transform_pose(camera), depth));
     if moved { rest.agreeing(&pose, params.max_error_sigmas, correspondences).len() } else { 0 }
+}
+
+/// Sights, as of points, that agree with the best pose that the remaining ones give, when it puts the set elsewhere.
+fn rival_of_sights(
+    params: &CamsetParams,
+    sights: &Sights,
+    (agreeing, lone): (&[usize], &[usize]),
+    best: &Similarity,
+    set_from_camera: &[Rigid],
+    seed: u64,
+) -> usize {
+    let Some(depth) = sights.depth(best) else { return 0 };
+    let rivals = sights.estimate(params, agreeing, &[], seed ^ 0x5eed).into_iter().filter(|pose| {
+        let moved = |camera| !same_pose(&pose.transform_pose(camera), &best.transform_pose(camera), depth);
+        set_from_camera.iter().any(moved)
+    });
+    let support = |pose: Similarity| {
+        let others = |found: Vec<usize>, best: &[usize]| -> Vec<usize> {
+            found.into_iter().filter(|at| best.binary_search(at).is_err()).collect()
+        };
+        let bound = params.max_error_sigmas;
+        let points = sights.points(&others(sights.agreeing(&pose, bound), agreeing)).len();
+        points + Sights::worth_of_lone(others(sights.agreeing_lone(&pose, bound), lone).len())
+    };
+    rivals.map(support).max().unwrap_or(0)
 }
 
 /// Poses of the set from each ordered pair of photos that are localized alone: one gives the rotation, both the scale.

@@ -3,9 +3,12 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use serde_json::json;
-use setloc_camset::{QueryPhoto, Scene, SetLocalization, SingleLocalization, locate_set, locate_single};
+use setloc_camset::{
+    QueryPhoto, Scene, SetLocalization, SingleLocalization, Views, likely_images, locate_set, locate_single,
+    match_views,
+};
 use setloc_features::ImageFeatures;
-use setloc_sfm::{MapperOutput, Reconstruction};
+use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
 
 use super::model::{ModelJobs, ModelKind, ModelSource, add_model};
 use super::{choose_pairs, derived_seed};
@@ -54,7 +57,10 @@ pub fn add_set(
     let model = add_model(graph, ModelKind::Local, name, source, &what.config, what.seed)?;
     let single = add_singles(graph, photos, &model.features, what);
     let listed: Vec<_> = photos.iter().map(|p| json!([p.name, p.camera, p.camera_fixed])).collect();
-    let params = json!({ "camset": what.config.camset, "seed": what.seed, "photos": listed });
+    let Config { camset, matching, two_view, .. } = &what.config;
+    let params = json!({
+        "camset": camset, "matching": matching, "two_view": two_view, "seed": what.seed, "photos": listed
+    });
     let (owned, what_here) = (photos.to_vec(), what.clone());
     let work = move |inputs: &Inputs<'_, '_>| run_set(inputs, &owned, &what_here);
     let set = graph.add(Job {
@@ -90,9 +96,29 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
     let empty = Reconstruction::default();
     let scene = scene_of(&what.scene, &empty);
     let seed = derived_seed(what.seed, &["camset"]);
+    // Whatever is wrong with the scene's features is said after what needs none of them.
+    let mut trouble = None;
+    let views = || {
+        let likely = likely_images(&scene, &alone, what.config.camset.views.max_images);
+        let read = |image: usize| match likely.binary_search(&ImageId(image as u32)) {
+            Ok(_) => what.scene.features_of(ImageId(image as u32)),
+            Err(_) => Ok(None),
+        };
+        let features = (0..scene.reconstruction.images.len()).map(read).collect::<Result<Vec<_>>>();
+        match features {
+            Ok(features) => {
+                let params = (&what.config.matching, &what.config.two_view);
+                match_views(params, &scene, features, &likely, &queries, seed)
+            }
+            Err(error) => {
+                trouble = Some(error);
+                Views::default()
+            }
+        }
+    };
     let located: SetLocalization =
-        locate_set(&what.config.camset, &scene, &queries, &alone, &model.components, seed);
-    Product::new(located)
+        locate_set(&what.config.camset, &scene, &queries, &alone, &model.components, views, seed);
+    trouble.map_or_else(|| Product::new(located), Err)
 }
 
 /// Adds the localization of each photo alone, from its features.

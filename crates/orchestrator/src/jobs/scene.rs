@@ -5,15 +5,16 @@ use nalgebra::Vector3;
 use serde_json::json;
 use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::{MapperOutput, MergeRecord, Reconstruction};
+use setloc_sfm::{MapperOutput, MergeRecord, Reconstruction, ReconstructionImage};
 
 use super::choose_pairs;
 use super::model::{ModelKind, ModelSource, add_model, image_of_place_holder, with_names};
+use crate::codec::Artifact;
 use crate::config::Config;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
-use crate::scene::SceneFile;
+use crate::scene::{Block, SceneFile};
 use crate::stages;
 
 /// The jobs of a scene.
@@ -80,9 +81,13 @@ pub fn add_scene(
             || output.components.iter().map(|model| named(model, &names)).collect(),
             || (*index).clone(),
         );
+        let (features, mut content) = (features_of_main(inputs, &output)?, Vec::new());
+        content.extend([inputs.hash("model")?, inputs.hash("index")?]);
+        content.extend(features.iter().map(|block| ContentHash::of(&block.0)));
         Product::new(SceneFile {
             components,
             index: copy,
+            features,
             origin: output.report.georegistration.as_ref().and(origin),
             warnings: (output.report.warnings.iter().map(|text| with_names(text, &names)))
                 .chain(index.recall().filter(|recall| *recall < MIN_RECALL).map(poor_recall))
@@ -91,7 +96,7 @@ pub fn add_scene(
                 .chain(index.recall().map(measured_recall))
                 .collect(),
             config: config.clone(),
-            content: ContentHash::of_all(&[inputs.hash("model")?, inputs.hash("index")?]),
+            content: ContentHash::of_all(&content),
         })
     };
     let scene = graph.add(Job {
@@ -105,11 +110,32 @@ pub fn add_scene(
     });
     graph.require(scene, "model", jobs.model);
     graph.require(scene, "index", index);
+    for (at, features) in jobs.features.iter().enumerate() {
+        graph.accept(scene, format!("features {at:04}"), *features);
+    }
     let mut features = jobs.features.clone();
     for (&at, &job) in order.iter().zip(&jobs.features) {
         features[at] = job;
     }
     Ok(SceneJobs { features, model: jobs.model, scene })
+}
+
+/// Keypoints of an image that go into the scene file, of the bright and of the dark: what pairs are screened by.
+const KEPT_FEATURES: usize = 2048;
+
+/// The strongest features of the registered images of the largest component, as blocks.
+fn features_of_main(inputs: &Inputs<'_, '_>, output: &MapperOutput) -> Result<Vec<Block>> {
+    let Some(model) = output.components.first() else { return Ok(Vec::new()) };
+    let block = |image: &ReconstructionImage| {
+        let (Some(at), Some(_)) = (image_of_place_holder(&image.name), image.world_from_camera) else {
+            return Ok(Block::default());
+        };
+        let features = inputs.get::<ImageFeatures>(&format!("features {at:04}"))?;
+        let mut block = Block::default();
+        features.strongest(KEPT_FEATURES).write_payload(&mut block.0)?;
+        Ok(block)
+    };
+    model.images.iter().map(block).collect()
 }
 
 /// Share of the nearest scene points below which an index is said to miss too many.
