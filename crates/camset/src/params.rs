@@ -151,7 +151,7 @@ impl CamsetParams {
             ratio: 0.6,
             reverse_ratio: 0.6,
             lone_rays: false,
-            views: ViewParams { max_images: 0 },
+            views: ViewParams { max_images: 0, ..ViewParams::default() },
             ..Self::default()
         }
     }

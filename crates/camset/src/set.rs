@@ -49,7 +49,8 @@ pub fn locate_set(
     better_of(by_points, by_views)
 }
 
-/// Of two answers the one in which more is localized, photo by photo; the first, where they contradict each other.
+/// The second answer, which knows more, where anything is localized better in it, but for photos that the first localizes
+/// better; the first altogether where they contradict each other.
 fn better_of(first: SetLocalization, second: SetLocalization) -> SetLocalization {
     let pairs = || first.refined.iter().zip(&second.refined);
     let is_localized = |photo: &PhotoLocalization| photo.verdict == Verdict::Localized;
@@ -67,12 +68,12 @@ fn better_of(first: SetLocalization, second: SetLocalization) -> SetLocalization
     }
     let mut best = second;
     for (kept, other) in best.refined.iter_mut().zip(first.refined) {
-        if rank(other.verdict) >= rank(kept.verdict) {
+        if rank(other.verdict) > rank(kept.verdict) {
             *kept = other;
         }
     }
     for (kept, other) in best.rigid.iter_mut().zip(first.rigid) {
-        if rank(other.verdict) >= rank(kept.verdict) {
+        if rank(other.verdict) > rank(kept.verdict) {
             *kept = other;
         }
     }

@@ -13,7 +13,7 @@ use setloc_sfm::{
     ReconstructionImage, ReconstructionPoint, Rigid, Similarity, TwoViewParams,
 };
 
-use crate::{QueryPhoto, Scene, SceneMatch, Views, match_views};
+use crate::{QueryPhoto, Scene, SceneMatch, ViewParams, Views, match_views};
 
 const NOISE_PX: f64 = 0.5;
 const VISIBLE: f64 = 35.0;
@@ -323,7 +323,15 @@ impl World {
             .map(|(image, view)| panoramas.contains(&image).then(|| view.features.clone()));
         let likely: Vec<ImageId> = panoramas.iter().copied().map(ImageId).collect();
         let params = (&MatchParams::default(), &TwoViewParams::default());
-        match_views(params, &self.scene(), features.collect(), &likely, &self.queries(), 5)
+        match_views(
+            &ViewParams::default(),
+            params,
+            &self.scene(),
+            features.collect(),
+            &likely,
+            &self.queries(),
+            5,
+        )
     }
 
     /// Makes the scene's points exact: without noise in the panoramas, the index gives them no covariance.

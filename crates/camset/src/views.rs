@@ -19,11 +19,14 @@ pub struct ViewParams {
     /// Most scene images that a set is matched with: those that see most of the scene points nearest to its features.
     /// 0 leaves it out.
     pub max_images: usize,
+    /// Fewest inliers of a verified pair. A mapper is led astray by a wrong pair (see `two_view.min_inliers`), here all
+    /// pairs of the set have to agree on one pose.
+    pub min_inliers: usize,
 }
 
 impl Default for ViewParams {
     fn default() -> Self {
-        Self { max_images: 48 }
+        Self { max_images: 48, min_inliers: 12 }
     }
 }
 
@@ -95,6 +98,7 @@ pub fn likely_images(scene: &Scene<'_>, alone: &[&SingleLocalization], most: usi
 /// `likely` are the images to match with; cameras of photos whose intrinsics are not known are taken as they are.
 /// (D. Nistér, "An efficient solution to the five-point relative pose problem", PAMI 2004, on rays.)
 pub fn match_views(
+    params: &ViewParams,
     (matching, two_view): (&MatchParams, &TwoViewParams),
     scene: &Scene<'_>,
     views: Vec<Option<ImageFeatures>>,
@@ -102,6 +106,7 @@ pub fn match_views(
     photos: &[QueryPhoto<'_>],
     seed: u64,
 ) -> Views {
+    let two_view = &TwoViewParams { min_inliers: params.min_inliers, ..two_view.clone() };
     let pairs: Vec<(usize, ImageId)> =
         (0..photos.len()).flat_map(|photo| likely.iter().map(move |&image| (photo, image))).collect();
     let matched = |&(photo, image): &(usize, ImageId)| {

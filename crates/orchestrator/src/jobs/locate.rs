@@ -107,8 +107,8 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
         let features = (0..scene.reconstruction.images.len()).map(read).collect::<Result<Vec<_>>>();
         match features {
             Ok(features) => {
-                let params = (&what.config.matching, &what.config.two_view);
-                match_views(params, &scene, features, &likely, &queries, seed)
+                let pairs = (&what.config.matching, &what.config.two_view);
+                match_views(&what.config.camset.views, pairs, &scene, features, &likely, &queries, seed)
             }
             Err(error) => {
                 trouble = Some(error);
