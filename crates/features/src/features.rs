@@ -89,15 +89,16 @@ impl ImageFeatures {
     #[must_use]
     pub fn strongest(&self, of_each: usize) -> Self {
         let [bright, dark] = self.parts().map(|part| part.start..part.end.min(part.start + of_each));
-        let kept = || bright.clone().chain(dark.clone());
+        let [bright_colors, dark_colors] =
+            [&bright, &dark].map(|part| self.colors.get(part.clone()).unwrap_or(&[]));
         Self {
             width: self.width,
             height: self.height,
-            keypoints: kept().map(|index| self.keypoints[index]).collect(),
+            keypoints: [&self.keypoints[bright.clone()], &self.keypoints[dark.clone()]].concat(),
             light: bright.len() as u32,
             simulated: Vec::new(),
-            descriptors: kept().flat_map(|index| self.descriptor(index)).copied().collect(),
-            colors: kept().filter_map(|index| self.colors.get(index)).copied().collect(),
+            descriptors: [self.descriptors_of(&bright), self.descriptors_of(&dark)].concat(),
+            colors: [bright_colors, dark_colors].concat(),
         }
     }
 

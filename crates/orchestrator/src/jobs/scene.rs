@@ -2,13 +2,14 @@ use std::collections::BTreeMap;
 
 use anyhow::Result;
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use serde_json::json;
 use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
 use setloc_sfm::{MapperOutput, MergeRecord, Reconstruction, ReconstructionImage};
 
 use super::choose_pairs;
-use super::model::{ModelKind, ModelSource, add_model, image_of_place_holder, with_names};
+use super::model::{ModelKind, ModelSource, add_model, features_role, image_of_place_holder, with_names};
 use crate::codec::Artifact;
 use crate::config::Config;
 use crate::dataset::SourceImage;
@@ -77,13 +78,16 @@ pub fn add_scene(
     let scene_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
         let index = inputs.get::<SceneIndex>("index")?;
-        let (components, copy) = rayon::join(
-            || output.components.iter().map(|model| named(model, &names)).collect(),
-            || (*index).clone(),
+        let ((components, copy), features) = rayon::join(
+            || (output.components.iter().map(|model| named(model, &names)).collect(), (*index).clone()),
+            || features_of_main(inputs, &output),
         );
-        let (features, mut content) = (features_of_main(inputs, &output)?, Vec::new());
-        content.extend([inputs.hash("model")?, inputs.hash("index")?]);
-        content.extend(features.iter().map(|block| ContentHash::of(&block.0)));
+        let features = features?;
+        let mut content = vec![inputs.hash("model")?, inputs.hash("index")?];
+        for image in output.components.iter().take(1).flat_map(|model| &model.images) {
+            let at = image_of_place_holder(&image.name).unwrap_or_default();
+            content.push(inputs.hash(&features_role(at))?);
+        }
         Product::new(SceneFile {
             components,
             index: copy,
@@ -121,7 +125,7 @@ pub fn add_scene(
 }
 
 /// Keypoints of an image that go into the scene file, of the bright and of the dark: what pairs are screened by.
-const KEPT_FEATURES: usize = 2048;
+const KEPT_FEATURES: usize = 1024;
 
 /// The strongest features of the registered images of the largest component, as blocks.
 fn features_of_main(inputs: &Inputs<'_, '_>, output: &MapperOutput) -> Result<Vec<Block>> {
@@ -130,12 +134,14 @@ fn features_of_main(inputs: &Inputs<'_, '_>, output: &MapperOutput) -> Result<Ve
         let (Some(at), Some(_)) = (image_of_place_holder(&image.name), image.world_from_camera) else {
             return Ok(Block::default());
         };
-        let features = inputs.get::<ImageFeatures>(&format!("features {at:04}"))?;
+        let features = inputs.get::<ImageFeatures>(&features_role(at))?;
         let mut block = Block::default();
         features.strongest(KEPT_FEATURES).write_payload(&mut block.0)?;
         Ok(block)
     };
-    model.images.iter().map(block).collect()
+    // Tens of megabytes are touched first here: on all cores.
+    let blocks: Vec<Result<Block>> = model.images.par_iter().with_max_len(1).map(block).collect();
+    blocks.into_iter().collect()
 }
 
 /// Share of the nearest scene points below which an index is said to miss too many.
