@@ -3,6 +3,7 @@
 mod correspondences;
 mod joint;
 mod rigid;
+mod scale;
 mod sights;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -67,12 +68,8 @@ fn better_of(first: SetLocalization, second: SetLocalization) -> SetLocalization
         return first;
     }
     let mut best = second;
-    for (kept, other) in best.refined.iter_mut().zip(first.refined) {
-        if rank(other.verdict) > rank(kept.verdict) {
-            *kept = other;
-        }
-    }
-    for (kept, other) in best.rigid.iter_mut().zip(first.rigid) {
+    let kept = best.refined.iter_mut().chain(&mut best.rigid);
+    for (kept, other) in kept.zip(first.refined.into_iter().chain(first.rigid)) {
         if rank(other.verdict) > rank(kept.verdict) {
             *kept = other;
         }

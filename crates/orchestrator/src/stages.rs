@@ -26,7 +26,7 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 ///
 /// 2: holds the hash of what localization depends on, and only the configuration that the scene depends on.
 /// 4: notes. 6: models state lengths that their points do not tell. 7: and the poses at
-/// their ends.
+/// their ends. 8: holds features of its images. 9: half as many.
 pub const SCENE_VERSION: u32 = 9;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;

@@ -1,14 +1,13 @@
 //! The pose of the rigid camera set, and whether another pose would do as well.
 
-use nalgebra::Vector3;
 use setloc_sfm::robust::{
     GeneralizedPoseOptions, GeneralizedRay, GeneralizedSolver, RansacParams, estimate_absolute_pose,
     estimate_generalized_pose,
 };
-use setloc_sfm::solvers::triangulation::length_along;
 use setloc_sfm::{ImageId, Reconstruction, ReconstructionPoint, Rigid, Similarity};
 
 use super::correspondences::{SetCorrespondence, SetRays};
+use super::scale::{About, most_voted};
 use super::sights::Sights;
 use crate::evidence::{median, same_pose};
 use crate::observability::{Observability, observability, refine_similarity};
@@ -66,7 +65,8 @@ pub(crate) fn rigid_pose(
                 model,
                 ImageId(photo as u32),
             ));
-            candidates.extend(rays.with_baselines(params, &axes_at_photo, &in_set.translation));
+            let about = About::photo(&axes_at_photo, in_set.translation);
+            candidates.extend(rays.with_baselines(params, &about));
         }
     }
     let bound = params.max_error_sigmas;
@@ -118,21 +118,24 @@ fn estimate(params: &CamsetParams, rays: &SetRays, seed: u64) -> Option<Similari
         .collect();
     let points: Vec<_> = rays.rays.iter().map(|ray| ray.point).collect();
     let ransac = RansacParams { max_error_sigma: params.max_error_sigmas, ..RansacParams::default() };
+    let options = solver_options(params);
+    estimate_generalized_pose(&ransac, &generalized, &points, &options, seed)
+        .map(|found| found.world_from_set)
+}
+
+/// How minimal samples of a set's rays become poses.
+pub(crate) fn solver_options(params: &CamsetParams) -> GeneralizedPoseOptions {
     let solver = match params.method {
         CamsetMethod::Gp4ps => GeneralizedSolver::Minimal,
         CamsetMethod::Dlt => GeneralizedSolver::Dlt,
     };
-    let options = GeneralizedPoseOptions { solver, ..GeneralizedPoseOptions::default() };
-    estimate_generalized_pose(&ransac, &generalized, &points, &options, seed)
-        .map(|found| found.world_from_set)
+    GeneralizedPoseOptions { solver, ..GeneralizedPoseOptions::default() }
 }
 
 /// Samples that a single photo's pose may cost.
 const PHOTO_SAMPLES: u32 = 3000;
 /// Fewest agreeing rays that make a single photo's pose worth a hypothesis; all rays of the set judge it afterwards.
 const PHOTO_INLIERS: usize = 5;
-/// Scales within this factor of each other agree.
-const SAME_SCALE: f64 = 1.03;
 /// Quantiles of the depth ratios that are tried as scale.
 const SCALE_QUANTILES: [f64; 3] = [0.5, 0.25, 0.75];
 
@@ -192,6 +195,7 @@ impl SetRays {
             ratios.extend(ratio.filter(|ratio| ratio.is_finite() && *ratio > 0.0));
         }
         let Some(origin) = self.rays.first().map(|ray| ray.origin) else { return Vec::new() };
+        let about = About::photo(axes_at_photo, origin);
         if ratios.len() < 3 {
             let sees = |point: &&ReconstructionPoint| point.track.iter().any(|seen| seen.image == photo);
             let local =
@@ -199,7 +203,7 @@ impl SetRays {
             let scale = median(depths).zip(median(local)).map(|(scene, local)| scene / local);
             return scale
                 .filter(|scale| scale.is_finite() && *scale > 0.0)
-                .map(|scale| scaled_about(axes_at_photo, &origin, scale))
+                .map(|scale| about.scaled(scale))
                 .into_iter()
                 .collect();
         }
@@ -208,7 +212,7 @@ impl SetRays {
             .iter()
             .map(|quantile| {
                 let scale = ratios[(quantile * (ratios.len() - 1) as f64).round() as usize];
-                scaled_about(axes_at_photo, &origin, scale)
+                about.scaled(scale)
             })
             .collect()
     }
@@ -217,38 +221,10 @@ impl SetRays {
     ///
     /// Where the photo that sees the scene shares no local point with it, a few rays of the next photos still agree on
     /// how far these are away, and wrong matches do not agree on anything.
-    fn with_baselines(
-        &self,
-        params: &CamsetParams,
-        axes_at_photo: &Rigid,
-        origin: &Vector3<f64>,
-    ) -> Vec<Similarity> {
-        let mut scales: Vec<f64> = self
-            .rays
-            .iter()
-            .filter_map(|ray| {
-                let step = axes_at_photo.rotation * (ray.origin - origin);
-                let direction = axes_at_photo.rotation * ray.direction;
-                let scale = length_along(&step, &(ray.point - axes_at_photo.translation), &direction)?;
-                let pose = scaled_about(axes_at_photo, origin, scale);
-                (ray.error_sigmas(&pose.inverse()) < params.max_error_sigmas).then_some(scale)
-            })
-            .collect();
-        scales.sort_by(f64::total_cmp);
-        // The scale that most others are near to.
-        let near = |at: usize| {
-            let (low, high) = (scales[at] / SAME_SCALE, scales[at] * SAME_SCALE);
-            scales.partition_point(|&scale| scale <= high) - scales.partition_point(|&scale| scale < low)
-        };
-        let best = (0..scales.len()).max_by_key(|&at| near(at)).filter(|&at| near(at) >= 3);
-        best.map(|at| scaled_about(axes_at_photo, origin, scales[at])).into_iter().collect()
+    fn with_baselines(&self, params: &CamsetParams, about: &About) -> Vec<Similarity> {
+        let scales = about.scales_of_rays(&self.rays, params.max_error_sigmas).collect();
+        most_voted(scales, 1).into_iter().map(|scale| about.scaled(scale)).collect()
     }
-}
-
-/// The set's pose that puts the photo at `origin` where it is, at this scale.
-fn scaled_about(axes_at_photo: &Rigid, origin: &Vector3<f64>, scale: f64) -> Similarity {
-    let rotation = axes_at_photo.rotation;
-    Similarity { scale, rotation, translation: axes_at_photo.translation - rotation * origin * scale }
 }
 
 /// Support of the best pose that the remaining rays give, when it puts the set elsewhere.

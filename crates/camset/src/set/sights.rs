@@ -1,21 +1,21 @@
 //! Local points as the scene's images show them: the set placed from the scene's side.
 
 mod lone;
-mod scale;
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix3, Vector3};
 use setloc_features::Camera;
-use setloc_sfm::robust::{
-    GeneralizedPoseOptions, GeneralizedRay, GeneralizedSolver, RansacParams, estimate_generalized_pose,
-};
+use setloc_sfm::robust::{GeneralizedRay, RansacParams, estimate_generalized_pose};
+use setloc_sfm::solvers::triangulation::length_along;
 use setloc_sfm::{ImageId, Observation, Place, Rigid, Similarity};
 
-use self::{lone::LoneSight, scale::About};
+use self::lone::LoneSight;
+use super::rigid::solver_options;
+use super::scale::{About, most_voted};
 use crate::evidence::{PhotoRays, log10_false_alarms, median, ray_error_sigmas};
 use crate::observability::SetRay;
-use crate::{CamsetMethod, CamsetParams, Scene, ViewGeometry, Views};
+use crate::{CamsetParams, Scene, ViewGeometry, Views};
 
 /// A keypoint of a scene image that shows a local point.
 #[derive(Debug, Clone)]
@@ -73,6 +73,8 @@ pub(crate) struct Sights {
 const MAX_POINT_SIGMA: f64 = 0.1;
 /// Samples that the pose from the scene's side may cost.
 const MAX_SAMPLES: u32 = 5000;
+/// Most scales that are tried about one place.
+const MAX_SCALES: usize = 3;
 /// Fewest sights of a second scene image, or more, that give the set a scale.
 const MIN_ELSEWHERE: usize = 3;
 /// What a lone sight, which is told by one coordinate, counts in the score beside one of a local point.
@@ -179,20 +181,18 @@ impl Sights {
         others: &[SetRay],
         seed: u64,
     ) -> Vec<Similarity> {
-        let mut found = self.by_samples(params, without, others, seed);
-        for about in &self.of_pairs {
+        let (mut found, by_samples) = match self.by_samples(params, without, seed) {
+            Some(Sampled::Pose(pose)) => (vec![pose], None),
+            Some(Sampled::About(about)) => (Vec::new(), Some(about)),
+            None => (Vec::new(), None),
+        };
+        for about in by_samples.iter().chain(&self.of_pairs) {
             found.extend(self.scales(params, about, others).into_iter().map(|scale| about.scaled(scale)));
         }
         found
     }
 
-    fn by_samples(
-        &self,
-        params: &CamsetParams,
-        without: &[usize],
-        others: &[SetRay],
-        seed: u64,
-    ) -> Vec<Similarity> {
+    fn by_samples(&self, params: &CamsetParams, without: &[usize], seed: u64) -> Option<Sampled> {
         let left = |at: &usize| without.binary_search(at).is_err();
         let used: Vec<&Sight> = (0..self.all.len()).filter(left).map(|at| &self.all[at]).collect();
         let rays: Vec<GeneralizedRay> = used.iter().map(|sight| sight.ray).collect();
@@ -202,30 +202,47 @@ impl Sights {
             max_iterations: MAX_SAMPLES,
             ..RansacParams::default()
         };
-        let solver = match params.method {
-            CamsetMethod::Gp4ps => GeneralizedSolver::Minimal,
-            CamsetMethod::Dlt => GeneralizedSolver::Dlt,
-        };
-        let options = GeneralizedPoseOptions { solver, ..GeneralizedPoseOptions::default() };
-        let Some(found) = estimate_generalized_pose(&ransac, &rays, &points, &options, seed) else {
-            return Vec::new();
-        };
+        let options = solver_options(params);
+        let found = estimate_generalized_pose(&ransac, &rays, &points, &options, seed)?;
         if found.scale_observable {
-            return vec![found.world_from_set.inverse()];
+            return Some(Sampled::Pose(found.world_from_set.inverse()));
         }
-        let Some(&first) = found.inliers.first() else { return Vec::new() };
-        let at = rays[first as usize].origin;
-        let about = About {
+        let at = rays[*found.inliers.first()? as usize].origin;
+        Some(Sampled::About(About {
             rotation: found.world_from_set.rotation.inverse(),
             in_set: found.world_from_set.transform_point(&at),
             in_scene: at,
-        };
-        self.scales(params, &about, others).into_iter().map(|scale| about.scaled(scale)).collect()
+        }))
+    }
+
+    /// The scales that most votes are near to, best first.
+    fn scales(&self, params: &CamsetParams, about: &About, others: &[SetRay]) -> Vec<f64> {
+        let bound = params.max_error_sigmas;
+        let by_points = about.scales_of_rays(others, bound);
+        let by_sights = self.all.iter().filter_map(|sight| {
+            let to = sight.ray.origin - about.in_scene;
+            let step = about.step(&self.positions[sight.local]);
+            let scale = length_along(&step, &to, &-sight.ray.direction)?;
+            (to.norm() > 0.0 && self.error_sigmas(sight, &about.scaled(scale)) < bound).then_some(scale)
+        });
+        let by_pairs = self.lone.iter().filter_map(|lone| {
+            let normal = (about.rotation * lone.own.direction).cross(&lone.ray.direction);
+            let to = lone.ray.origin - about.in_scene;
+            let scale = to.dot(&normal) / about.step(&lone.own.origin).dot(&normal);
+            (to.norm() > 0.0 && lone.error_sigmas(&about.scaled(scale)) < bound).then_some(scale)
+        });
+        let votes = by_points.chain(by_sights).chain(by_pairs);
+        most_voted(votes.filter(|scale| scale.is_finite() && *scale > 0.0).collect(), MAX_SCALES)
+    }
+
+    /// From a scene image to the local point that it shows, under a pose.
+    fn offset(&self, sight: &Sight, world_from_set: &Similarity) -> Vector3<f64> {
+        world_from_set.transform_point(&self.positions[sight.local]) - sight.ray.origin
     }
 
     /// Error in standard deviations of the ray and of the local point together.
     fn error_sigmas(&self, sight: &Sight, world_from_set: &Similarity) -> f64 {
-        let offset = world_from_set.transform_point(&self.positions[sight.local]) - sight.ray.origin;
+        let offset = self.offset(sight, world_from_set);
         let covariance = world_from_set.transform_covariance(&sight.covariance);
         ray_error_sigmas(&sight.ray.direction, sight.ray.sigma, &offset, &covariance)
     }
@@ -261,9 +278,7 @@ impl Sights {
 
     /// Median distance of what the scene's images see: local points, and where lone rays meet.
     pub(crate) fn depth(&self, world_from_set: &Similarity) -> Option<f64> {
-        let of_points = self.all.iter().map(|sight| {
-            (world_from_set.transform_point(&self.positions[sight.local]) - sight.ray.origin).norm()
-        });
+        let of_points = self.all.iter().map(|sight| self.offset(sight, world_from_set).norm());
         let of_lone = self.lone.iter().filter_map(|lone| lone.distance(world_from_set));
         median(of_points.chain(of_lone).collect())
     }
@@ -320,7 +335,7 @@ impl Sights {
     ) -> f64 {
         let chance = |&at: &usize| {
             let sight = &self.all[at];
-            let offset = world_from_set.transform_point(&self.positions[sight.local]) - sight.ray.origin;
+            let offset = self.offset(sight, world_from_set);
             let covariance = world_from_set.transform_covariance(&sight.covariance);
             let across = (covariance.trace() / 3.0).max(0.0) / offset.norm_squared().max(f64::MIN_POSITIVE);
             // Share of the seen part of the sphere, 4π in all, within the bound.
@@ -331,6 +346,13 @@ impl Sights {
         let matches = self.all_points().len();
         log10_false_alarms(matches, self.points(agreeing).len(), sample, mean.clamp(1e-12, 1.0))
     }
+}
+
+/// What samples of sights tell.
+enum Sampled {
+    Pose(Similarity),
+    /// All sights of one scene image: not the scale.
+    About(About),
 }
 
 /// A local point that sights may be of.

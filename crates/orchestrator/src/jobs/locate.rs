@@ -10,7 +10,7 @@ use setloc_camset::{
 use setloc_features::ImageFeatures;
 use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
 
-use super::model::{ModelJobs, ModelKind, ModelSource, add_model};
+use super::model::{ModelJobs, ModelKind, ModelSource, add_model, features_role};
 use super::{choose_pairs, derived_seed};
 use crate::config::Config;
 use crate::dataset::SourceImage;
@@ -74,7 +74,7 @@ pub fn add_set(
     });
     graph.require(set, "local_model", model.model);
     for (at, (features, single)) in model.features.iter().zip(&single).enumerate() {
-        graph.accept(set, format!("features {at:04}"), *features);
+        graph.accept(set, features_role(at), *features);
         graph.accept(set, format!("single {at:04}"), *single);
     }
     Ok(SetJobs { model, single, set })
@@ -85,7 +85,7 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
     let (mut features, mut alone) = (Vec::new(), Vec::new());
     for (at, photo) in photos.iter().enumerate() {
         // The local model has the same images in the same order: those whose features exist.
-        let Some(found) = inputs.find::<ImageFeatures>(&format!("features {at:04}"))? else { continue };
+        let Some(found) = inputs.find::<ImageFeatures>(&features_role(at))? else { continue };
         features.push((photo, found));
         let by_itself = inputs.find::<SingleLocalization>(&format!("single {at:04}"))?;
         alone.push(by_itself.with_context(|| format!("{} was not located alone", photo.name))?);
