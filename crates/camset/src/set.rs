@@ -27,27 +27,30 @@ use joint::{Component, ComponentAnswer};
 ///
 /// `views` is asked for what the photos share with the scene's images beside its points ([`crate::match_views`]), only
 /// where photos are left that the points do not localize.
-pub fn locate_set(
+///
+/// # Errors
+/// Those of `views`.
+pub fn locate_set<E>(
     params: &CamsetParams,
     scene: &Scene<'_>,
     photos: &[QueryPhoto<'_>],
     alone: &[&SingleLocalization],
     local_models: &[Reconstruction],
-    views: impl FnOnce() -> Views,
+    views: impl FnOnce() -> Result<Views, E>,
     seed: u64,
-) -> SetLocalization {
+) -> Result<SetLocalization, E> {
     let photos = &photos[..photos.len().min(alone.len())];
     let evidence = &alone[..photos.len()];
     let by_points = locate_by(params, scene, (photos, evidence), local_models, &Views::default(), seed);
     if by_points.refined.iter().all(|photo| photo.verdict == Verdict::Localized) {
-        return by_points;
+        return Ok(by_points);
     }
-    let views = views();
+    let views = views()?;
     if views.matches.is_empty() {
-        return by_points;
+        return Ok(by_points);
     }
     let by_views = locate_by(params, scene, (photos, evidence), local_models, &views, seed);
-    better_of(by_points, by_views)
+    Ok(better_of(by_points, by_views))
 }
 
 /// The second answer, which knows more, where anything is localized better in it, but for photos that the first localizes
@@ -252,6 +255,8 @@ fn or_alone(
 
 #[cfg(test)]
 mod tests {
+    use std::convert::Infallible;
+
     use nalgebra::{UnitQuaternion, Vector3};
 
     use super::*;
@@ -268,15 +273,21 @@ mod tests {
     ) -> SetLocalization {
         let alone = photos.iter().map(|photo| locate_single(&SingleParams::default(), scene, photo, seed));
         let alone: Vec<SingleLocalization> = alone.collect();
-        locate_set(
-            params,
-            scene,
-            photos,
-            &alone.iter().collect::<Vec<_>>(),
-            local_models,
-            Views::default,
-            seed,
-        )
+        locate_with(params, scene, (photos, &alone), local_models, Views::default, seed)
+    }
+
+    fn locate_with(
+        params: &CamsetParams,
+        scene: &Scene<'_>,
+        (photos, alone): (&[QueryPhoto<'_>], &[SingleLocalization]),
+        local_models: &[Reconstruction],
+        views: impl FnOnce() -> Views,
+        seed: u64,
+    ) -> SetLocalization {
+        let alone: Vec<&SingleLocalization> = alone.iter().collect();
+        let Ok(found) =
+            locate_set(params, scene, photos, &alone, local_models, || Ok::<_, Infallible>(views()), seed);
+        found
     }
 
     fn locate(world: &World, params: &CamsetParams) -> SetLocalization {
@@ -313,15 +324,10 @@ mod tests {
         world.forget_seen_points();
         let alone = |photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7);
         let alone: Vec<SingleLocalization> = world.queries().iter().map(alone).collect();
-        let found = locate_set(
-            &CamsetParams::default(),
-            &world.scene(),
-            &world.queries(),
-            &alone.iter().collect::<Vec<_>>(),
-            std::slice::from_ref(&world.local),
-            || world.views(panoramas),
-            7,
-        );
+        let models = std::slice::from_ref(&world.local);
+        let photos = (&*world.queries(), &*alone);
+        let views = || world.views(panoramas);
+        let found = locate_with(&CamsetParams::default(), &world.scene(), photos, models, views, 7);
         (world, found)
     }
 
@@ -358,7 +364,8 @@ mod tests {
             let locate = |panoramas: &[u32]| {
                 let views = || world.views(panoramas);
                 let params = CamsetParams::default();
-                locate_set(&params, &world.scene(), &world.queries(), &[&alone], &[], views, 7)
+                let photos = (&*world.queries(), std::slice::from_ref(&alone));
+                locate_with(&params, &world.scene(), photos, &[], views, 7)
             };
             let found = locate(&[5, 7]);
             assert_eq!(found.refined[0].verdict, Verdict::Localized, "{:#?}", found.refined[0]);
@@ -370,6 +377,25 @@ mod tests {
     }
 
     #[test]
+    fn views_that_cannot_be_had_are_an_error_where_they_are_needed() {
+        let mut world = World::chain(6, 0.2, 1);
+        let photos = |world: &World| -> Vec<SingleLocalization> {
+            let alone = |photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7);
+            world.queries().iter().map(alone).collect()
+        };
+        let locate = |world: &World| {
+            let alone = photos(world);
+            let alone: Vec<&SingleLocalization> = alone.iter().collect();
+            let models = std::slice::from_ref(&world.local);
+            let (params, queries) = (CamsetParams::default(), world.queries());
+            locate_set(&params, &world.scene(), &queries, &alone, models, || Err("damaged"), 7)
+        };
+        assert!(locate(&world).is_ok());
+        world.forget_seen_points();
+        assert_eq!(locate(&world), Err("damaged"));
+    }
+
+    #[test]
     fn views_of_another_place_localize_nothing() {
         let mut world = World::chain_in(&Place::street(3500, 21), 6, 0.2, 21);
         let other = World::chain_in(&Place::street(3500, 21).shuffled(4), 6, 0.2, 21);
@@ -378,11 +404,11 @@ mod tests {
         world.forget_seen_points();
         let alone = |photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7);
         let alone: Vec<SingleLocalization> = world.queries().iter().map(alone).collect();
-        let alone: Vec<&SingleLocalization> = alone.iter().collect();
         for models in [vec![world.local.clone()], Vec::new()] {
             let views = || world.views(&[4, 5, 6, 7]);
             let params = CamsetParams::default();
-            let found = locate_set(&params, &world.scene(), &world.queries(), &alone, &models, views, 7);
+            let photos = (&*world.queries(), &*alone);
+            let found = locate_with(&params, &world.scene(), photos, &models, views, 7);
             for photo in &found.refined {
                 assert_ne!(photo.verdict, Verdict::Localized, "{photo:#?}");
             }

@@ -20,6 +20,9 @@ pub struct FeatureParams {
     pub max_side: u32,
     /// Least contrast of a keypoint, as OpenCV scales it; lower gives more and weaker points.
     pub contrast_threshold: f64,
+    /// Keypoints below which weaker ones are taken in, down to a quarter of `contrast_threshold`: bare walls have little
+    /// contrast, and all that there is. 0 never does; never more than `max_features`.
+    pub min_features: usize,
     /// Largest ratio of principal curvatures; lower drops more points on edges.
     pub edge_threshold: f64,
     /// Scales per octave.
@@ -45,7 +48,8 @@ impl FeatureParams {
     ///
     /// 1: OpenCV SIFT, RootSIFT u8, half-pixel corrected, seam padded, spread over the sphere.
     /// 2: own SIFT, bright and dark spots apart. 3: simulated views. 4: large simulated views without their finest points.
-    pub const VERSION: u32 = 4;
+    /// 5: weaker keypoints where there are few.
+    pub const VERSION: u32 = 5;
 
     /// Checks the ranges.
     ///
@@ -82,6 +86,7 @@ impl Default for FeatureParams {
             max_features: 16384,
             max_side: 4096,
             contrast_threshold: 0.04,
+            min_features: 4096,
             edge_threshold: 10.0,
             octave_layers: 3,
             sigma_px: 1.6,
@@ -98,6 +103,8 @@ const SEAM_SHARE: usize = 24;
 /// A simulated view of more pixels is not doubled for detection: its finest points are hardly ever what a pair lacks that needs
 /// it, and cost three quarters of the time. Smaller photos need all that they have.
 const DOUBLED_VIEW_PIXELS: usize = 500_000;
+/// Contrast of the weakest keypoints of images that have few, as a share of the usual.
+const WEAK_CONTRAST: f64 = 0.25;
 /// Cells along the longer side of the grid that spreads keypoints.
 const CELLS: usize = 16;
 /// Detects SIFT keypoints and describes them as RootSIFT.
@@ -172,8 +179,15 @@ impl Source<'_> {
     fn append_view(&self, view: &Grey, factor: [f32; 2], budget: usize, features: &mut ImageFeatures) -> u32 {
         let Self { params, image, camera, .. } = self;
         let (width, height) = (image.width, image.height);
+        // In proportion to what the view may have at most.
+        let fewest = params.min_features.min(params.max_features) * budget / params.max_features;
+        let is_usual = |candidate: &Candidate| {
+            f64::from(candidate.response) * f64::from(params.octave_layers) >= params.contrast_threshold
+        };
         let sift = SiftParams {
             contrast_threshold: params.contrast_threshold,
+            weak_contrast_threshold: WEAK_CONTRAST * params.contrast_threshold,
+            min_points: fewest,
             edge_threshold: params.edge_threshold,
             octave_layers: params.octave_layers as usize,
             sigma_px: params.sigma_px,
@@ -205,7 +219,9 @@ impl Source<'_> {
                     .then(a.x.total_cmp(&b.x))
                     .then(a.index.cmp(&b.index))
             });
-            let mut chosen = choose(budget, params.even_share, camera, &candidates);
+            let (usual, weaker) = candidates.split_at(candidates.partition_point(is_usual));
+            let mut chosen = choose(budget, params.even_share, camera, usual);
+            chosen.extend(choose(fewest.saturating_sub(usual.len()), params.even_share, camera, weaker));
             chosen.sort_by_key(|candidate| !candidate.is_light);
             chosen.iter().map(|candidate| candidate.index).collect()
         };
@@ -415,6 +431,10 @@ mod tests {
 
     /// Bright Gaussian blobs of 4 pixels on grey, x periodic.
     fn blobs(width: u32, height: u32, centers: &[[f64; 2]]) -> DecodedImage {
+        blobs_of(150.0, width, height, centers)
+    }
+
+    fn blobs_of(brightness: f64, width: u32, height: u32, centers: &[[f64; 2]]) -> DecodedImage {
         let mut rgb = Vec::new();
         for y in 0..height {
             for x in 0..width {
@@ -423,7 +443,7 @@ mod tests {
                     let dx = (f64::from(x) + 0.5 - center[0]).abs();
                     let dx = dx.min(f64::from(width) - dx);
                     let dy = f64::from(y) + 0.5 - center[1];
-                    value += 150.0 * (-(dx * dx + dy * dy) / (2.0 * BLOB * BLOB)).exp();
+                    value += brightness * (-(dx * dx + dy * dy) / (2.0 * BLOB * BLOB)).exp();
                 }
                 rgb.extend([value.min(255.0) as u8; 3]);
             }
@@ -469,6 +489,30 @@ mod tests {
         for center in centers {
             assert!(nearest(&features, center) < 0.05, "{center:?}: {}", nearest(&features, center));
         }
+    }
+
+    #[test]
+    fn faint_keypoints_are_taken_in_where_there_are_few() {
+        let (faint, clear) = ([[60.5, 70.5], [130.3, 60.8]], [[90.75, 140.25], [170.0, 150.0]]);
+        let mut image = blobs_of(18.0, 240, 200, &faint);
+        for (value, clear) in image.rgb.iter_mut().zip(&blobs_of(90.0, 240, 200, &clear).rgb) {
+            *value += clear - 60;
+        }
+        let found = |min_features| {
+            let params = FeatureParams { min_features, ..FeatureParams::default() };
+            extract(&params, &image, &photo(240, 200), None).unwrap()
+        };
+        let (without, with) = (found(0), found(4096));
+        for center in clear {
+            assert!(nearest(&without, center) < 0.1 && nearest(&with, center) < 0.1);
+        }
+        for center in faint {
+            assert!(nearest(&without, center) > 5.0, "{}", nearest(&without, center));
+            assert!(nearest(&with, center) < 0.5, "{}", nearest(&with, center));
+        }
+        // Enough is enough; and of the faint ones no more than are asked for.
+        assert_eq!(found(without.len()), without);
+        assert_eq!(found(without.len() + 1).len(), without.len() + 1);
     }
 
     #[test]

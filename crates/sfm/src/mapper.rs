@@ -11,11 +11,14 @@ mod merge;
 mod model;
 mod nearby;
 mod plane;
+mod projection;
 mod register;
 mod repeated;
 mod sides;
 mod standpoint;
 mod structure;
+#[cfg(test)]
+mod test_street;
 mod wall;
 
 use std::collections::BTreeMap;
@@ -37,6 +40,7 @@ use self::{
     continuation::{Continued, continue_planes},
     correspondence::CorrespondenceGraph,
     model::Model,
+    projection::search_by_projection,
     register::{
         PoseHypothesis, Visibility, count_scene_matches, hypothesize, hypothesize_baseline,
         hypothesize_from_pairs, register, visibility,
@@ -52,7 +56,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 14;
+pub const MAPPER_VERSION: u32 = 15;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -756,6 +760,13 @@ impl<'a> Mapper<'a> {
             settle_pose(&mut self.model, &self.graph, self.params, image, self.seed);
         }
         self.refine(4, 20);
+        // A second time with the better poses.
+        for _ in 0..2 {
+            if search_by_projection(&mut self.model, self.params.max_error_sigma) == 0 {
+                break;
+            }
+            self.refine(1, 20);
+        }
         self.adjust_all(30);
         self.filter_all();
     }

@@ -31,6 +31,9 @@ const PHOTO_SIGMA: f64 = 0.5;
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct SiftParams {
     pub contrast_threshold: f64,
+    /// The threshold where there are fewer than `min_points` with that contrast.
+    pub weak_contrast_threshold: f64,
+    pub min_points: usize,
     pub edge_threshold: f64,
     pub octave_layers: usize,
     pub sigma_px: f64,
@@ -88,7 +91,11 @@ pub(crate) fn detect_and_describe(
 ) -> (Vec<SiftPoint>, Vec<[f32; DESCRIPTOR_LEN]>) {
     let level = Level::detect();
     let mut space = idle_workspaces().pop().unwrap_or_default();
-    let points = space.detect(level, params, image, allows);
+    let mut points = space.detect(level, params, image, &allows);
+    if points.len() < params.min_points {
+        let weaker = SiftParams { contrast_threshold: params.weak_contrast_threshold, ..params.clone() };
+        points = space.detect(level, &weaker, image, &allows);
+    }
     let chosen: Vec<SiftPoint> = choose(&points).into_iter().map(|index| points[index]).collect();
     let descriptors = space.describe(level, params, &chosen);
     idle_workspaces().push(space);

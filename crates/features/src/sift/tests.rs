@@ -8,6 +8,8 @@ use super::*;
 
 const PARAMS: SiftParams = SiftParams {
     contrast_threshold: 0.04,
+    weak_contrast_threshold: 0.01,
+    min_points: 0,
     edge_threshold: 10.0,
     octave_layers: 3,
     sigma_px: 1.6,

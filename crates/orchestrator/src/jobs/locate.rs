@@ -96,29 +96,19 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
     let empty = Reconstruction::default();
     let scene = scene_of(&what.scene, &empty);
     let seed = derived_seed(what.seed, &["camset"]);
-    // Whatever is wrong with the scene's features is said after what needs none of them.
-    let mut trouble = None;
-    let views = || {
+    let views = || -> Result<Views> {
         let likely = likely_images(&scene, &alone, what.config.camset.views.max_images);
         let read = |image: usize| match likely.binary_search(&ImageId(image as u32)) {
             Ok(_) => what.scene.features_of(ImageId(image as u32)),
             Err(_) => Ok(None),
         };
-        let features = (0..scene.reconstruction.images.len()).map(read).collect::<Result<Vec<_>>>();
-        match features {
-            Ok(features) => {
-                let pairs = (&what.config.matching, &what.config.two_view);
-                match_views(&what.config.camset.views, pairs, &scene, features, &likely, &queries, seed)
-            }
-            Err(error) => {
-                trouble = Some(error);
-                Views::default()
-            }
-        }
+        let features = (0..scene.reconstruction.images.len()).map(read).collect::<Result<Vec<_>>>()?;
+        let pairs = (&what.config.matching, &what.config.two_view);
+        Ok(match_views(&what.config.camset.views, pairs, &scene, features, &likely, &queries, seed))
     };
     let located: SetLocalization =
-        locate_set(&what.config.camset, &scene, &queries, &alone, &model.components, views, seed);
-    trouble.map_or_else(|| Product::new(located), Err)
+        locate_set(&what.config.camset, &scene, &queries, &alone, &model.components, views, seed)?;
+    Product::new(located)
 }
 
 /// Adds the localization of each photo alone, from its features.

@@ -26,25 +26,21 @@ impl Scope {
         Self { free_images: model.registered().collect(), points: model.live_ids(), intrinsics: true }
     }
 
-    /// `image` and the `neighbours` images that share most points with it.
+    /// `image` and the `neighbours` images that share most points with it, with all points that any of them sees: what a
+    /// neighbour sees beside the image holds it, too.
     pub fn local(model: &Model<'_>, image: ImageId, neighbours: usize) -> Self {
         let mut shared = vec![0_usize; model.poses.len()];
-        let mut points = Vec::new();
         for (_, id) in model.observations_of(image) {
-            if let Some(point) = model.point(id) {
-                points.push(id);
-                for seen in &point.track {
-                    shared[seen.image.index()] += 1;
-                }
+            for seen in model.point(id).into_iter().flat_map(|point| &point.track) {
+                shared[seen.image.index()] += 1;
             }
         }
-        points.sort_unstable();
-        points.dedup();
         let mut others: Vec<ImageId> =
             model.registered().filter(|&other| other != image && shared[other.index()] > 0).collect();
         others.sort_by_key(|other| (std::cmp::Reverse(shared[other.index()]), *other));
         others.truncate(neighbours);
         others.push(image);
+        let points = model.seen_by(&others);
         Self { free_images: others, points, intrinsics: false }
     }
 }
@@ -139,4 +135,40 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
         }
     }
     report
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{
+        MapperParams,
+        structure::triangulate_image,
+        test_street::{Street, first_two},
+    };
+    use super::*;
+    use crate::{Rigid, synthetic::rotation_angle};
+
+    /// A third image that shares a few far points with the others has no say in how these stand to each other.
+    #[test]
+    fn what_neighbours_see_without_the_image_holds_them() {
+        let street = Street::new("local", 14, 14);
+        let (input, params) = (street.input(), MapperParams::default());
+        let mut model = first_two(&street, &input);
+        let image = ImageId(2);
+        let off = nalgebra::Vector3::new(0.3, 0.0, 0.5);
+        model.set_pose(image, Some(Rigid::new(street.poses[2].rotation, street.poses[2].translation + off)));
+        let wide = params.max_error_sigma * 50.0;
+        let limits = super::super::structure::PointLimits { max_error_sigma: wide, ..params.limits() };
+        triangulate_image(&mut model, &street.graph(), limits, image);
+        let scope = Scope::local(&model, image, 1);
+        assert!(scope.points.len() > 100, "{}", scope.points.len());
+        adjust(&mut model, &params.bundle(10), &scope);
+        for (index, truth) in street.poses.iter().enumerate().take(2) {
+            let pose = model.poses[index].expect("is registered").world_from_camera;
+            let (rotation, center) = (
+                rotation_angle(&pose.rotation, &truth.rotation),
+                (pose.translation - truth.translation).norm(),
+            );
+            assert!(rotation < 3e-3 && center < 0.03, "{index}: {rotation} {center}");
+        }
+    }
 }

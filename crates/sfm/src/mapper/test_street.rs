@@ -1,0 +1,101 @@
+//! Three panoramas along a street for tests.
+
+use nalgebra::{UnitQuaternion, Vector3};
+use rand::Rng;
+use setloc_features::{Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
+
+use super::structure::triangulate_image;
+use super::{InputImage, MapperInput, MapperParams, correspondence::CorrespondenceGraph, model::Model};
+use crate::{
+    CameraId, ImageId, PairGeometry, Rigid, TwoView, TwoViewKind, TwoViewParams,
+    synthetic::{normal, seeded},
+};
+
+const NOISE_PX: f64 = 0.3;
+/// Points that all three see.
+pub(super) const POINTS: usize = 160;
+
+pub(super) struct Street {
+    camera: Camera,
+    features: Vec<ImageFeatures>,
+    pairs: Vec<PairGeometry>,
+    pub poses: Vec<Rigid>,
+}
+
+impl Street {
+    /// The first two images match all points; the third matches the first `with_first` of them, which lie ahead, with the
+    /// first, and those up to `with_second` with the second.
+    pub fn new(seed: &str, with_first: usize, with_second: usize) -> Self {
+        let mut rng = seeded(seed);
+        let camera = Camera::equirectangular(2048, 1024);
+        let pose = |z: f64, yaw: f64| {
+            let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), yaw);
+            Rigid::new(turn, Vector3::new(0.3 * yaw, 0.0, z))
+        };
+        let poses = vec![pose(0.0, 0.1), pose(8.0, -0.4), pose(17.0, 0.7)];
+        let points: Vec<Vector3<f64>> = (0..POINTS)
+            .map(|at| {
+                let side = if at % 2 == 0 { 9.0 } else { -9.0 };
+                let along =
+                    if at < with_first { rng.random_range(28.0..34.0) } else { rng.random_range(-4.0..22.0) };
+                Vector3::new(side, rng.random_range(-4.0..2.0), along)
+            })
+            .collect();
+        let descriptors: Vec<[u8; DESCRIPTOR_LEN]> =
+            points.iter().map(|_| std::array::from_fn(|_| rng.random_range(0..100))).collect();
+        let features_of = |pose: &Rigid| {
+            let mut features = ImageFeatures { width: 2048, height: 1024, ..ImageFeatures::default() };
+            for (point, descriptor) in points.iter().zip(&descriptors) {
+                let pixel = camera.project(&pose.inverse_transform_point(point)).expect("sees all around");
+                let [x, y] = [pixel.x, pixel.y].map(|at| (at + NOISE_PX * normal(&mut rng)) as f32);
+                let noise_px = NOISE_PX as f32;
+                features.keypoints.push(Keypoint { x, y, size: 4.0, orientation: 0.0, noise_px });
+                features.colors.push([128; 3]);
+                features.descriptors.extend(descriptor);
+            }
+            features
+        };
+        let features: Vec<ImageFeatures> = poses.iter().map(features_of).collect();
+        let pair = |first: usize, second: usize, matches: usize| PairGeometry {
+            first: ImageId(first as u32),
+            second: ImageId(second as u32),
+            two_view: TwoView {
+                kind: TwoViewKind::General,
+                second_from_first: poses[second].inverse() * poses[first],
+                inliers: (0..matches as u32).map(|at| Match { first: at, second: at }).collect(),
+                median_parallax_rad: 0.5,
+            },
+        };
+        let pairs = vec![pair(0, 1, POINTS), pair(0, 2, with_first), pair(1, 2, with_second)];
+        Self { camera, features, pairs, poses }
+    }
+
+    pub fn input(&self) -> MapperInput<'_> {
+        let images = self.features.iter().map(|features| InputImage::new("panorama", CameraId(0), features));
+        MapperInput {
+            cameras: vec![self.camera.clone()],
+            camera_fixed: vec![true],
+            images: images.collect(),
+            pairs: &self.pairs,
+            putative: &[],
+            two_view: TwoViewParams::default(),
+        }
+    }
+
+    pub fn graph(&self) -> CorrespondenceGraph {
+        CorrespondenceGraph::build(&[POINTS; 3], &self.pairs, &vec![true; self.pairs.len()])
+    }
+
+    pub fn features_mut(&mut self, image: usize) -> &mut ImageFeatures {
+        &mut self.features[image]
+    }
+}
+
+/// The model of the first two images at their true poses.
+pub(super) fn first_two<'a>(street: &Street, input: &'a MapperInput<'a>) -> Model<'a> {
+    let mut model = Model::new(input);
+    model.set_pose(ImageId(0), Some(street.poses[0]));
+    model.set_pose(ImageId(1), Some(street.poses[1]));
+    triangulate_image(&mut model, &street.graph(), MapperParams::default().limits(), ImageId(0));
+    model
+}
