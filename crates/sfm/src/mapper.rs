@@ -308,7 +308,22 @@ fn reconstruct_images(params: &MapperParams, input: &MapperInput<'_>, seed: u64)
         parts.push(mapper.into_part());
     }
     let parts = merge::join_supported(params, input, parts, &mut report, seed);
-    MapperOutput { components: parts.into_iter().map(|part| part.component).collect(), report }
+    let parts = parts.into_iter().map(|part| seen_again(params, input, part, seed));
+    MapperOutput { components: parts.map(|part| part.component).collect(), report }
+}
+
+/// The part with further observations of its points, where images have few.
+///
+/// Not before parts are joined: what they ought to share is measured by what the ratio test finds within each.
+fn seen_again(params: &MapperParams, input: &MapperInput<'_>, part: Part, seed: u64) -> Part {
+    if !projection::has_images_with_few_points(&part.component) {
+        return part;
+    }
+    let model = Model::of_component(input, &part.component);
+    let taken = part.component.images.iter().map(|image| image.world_from_camera.is_none()).collect();
+    let mut mapper = Mapper::over(params, model, taken, seed);
+    mapper.anchors.clone_from(&part.anchors);
+    if mapper.see_again() { mapper.into_part() } else { part }
 }
 
 /// The image that each image was turned from, and the turn, where it entered so.
@@ -760,14 +775,24 @@ impl<'a> Mapper<'a> {
             settle_pose(&mut self.model, &self.graph, self.params, image, self.seed);
         }
         self.refine(4, 20);
-        // A second time with the better poses.
+        self.adjust_all(30);
+        self.filter_all();
+    }
+
+    /// Seeks further observations of points, a second time with the better poses; whether there were any.
+    fn see_again(&mut self) -> bool {
+        let mut found = false;
         for _ in 0..2 {
             if search_by_projection(&mut self.model, self.params.max_error_sigma) == 0 {
                 break;
             }
+            found = true;
             self.refine(1, 20);
         }
-        self.adjust_all(30);
-        self.filter_all();
+        if found {
+            self.adjust_all(30);
+            self.filter_all();
+        }
+        found
     }
 }

@@ -165,14 +165,17 @@ impl Street {
         let target: Vec<_> = registered.iter().map(|image| self.truth[image.index()].translation).collect();
         let truth_from_world =
             Similarity::from_point_pairs(&source, &target).expect("centres are not collinear");
-        let (mut worst_m, mut worst_deg) = (0.0_f64, 0.0_f64);
+        let (mut worst_m, mut turns) = (0.0_f64, Vec::new());
         for image in &registered {
             let aligned = truth_from_world.transform_pose(&pose(image));
             let truth = &self.truth[image.index()];
             worst_m = worst_m.max((aligned.translation - truth.translation).norm());
-            worst_deg = worst_deg.max(aligned.rotation.angle_to(&truth.rotation).to_degrees());
+            turns.push((aligned.rotation * truth.rotation.inverse()).scaled_axis());
         }
-        (registered.len(), worst_m, worst_deg)
+        // Centres nearly in a line leave the turn about it to their last millimetres: what all have in common is no error.
+        let common = turns.iter().sum::<Vector3<f64>>() / turns.len() as f64;
+        let worst_rad = turns.iter().map(|turn| (turn - common).norm()).fold(0.0, f64::max);
+        (registered.len(), worst_m, worst_rad.to_degrees())
     }
 }
 

@@ -7,7 +7,7 @@ use super::{
     model::{Model, ModelPoint},
     register::is_in_view,
 };
-use crate::{ImageId, Observation, PointId};
+use crate::{ImageId, Observation, PointId, Reconstruction};
 
 /// Points that three images see from which on an image has enough: what is found like this is seen from far apart, and placed
 /// worse than what the ratio test finds (0.50 px of residual on a dense street in place of 0.41).
@@ -19,6 +19,17 @@ const MAX_DESCRIPTOR_DISTANCE: f64 = 0.5;
 const MAX_VIEW_ANGLE_RAD: f64 = 1.0;
 /// Largest ratio of the distances of both to the point.
 const MAX_DISTANCE_RATIO: f64 = 3.0;
+
+/// Whether points are worth seeking in any image.
+pub(super) fn has_images_with_few_points(component: &Reconstruction) -> bool {
+    let mut of_three = vec![0_usize; component.images.len()];
+    for point in component.points.iter().filter(|point| point.track.len() > 2) {
+        for seen in &point.track {
+            of_three[seen.image.index()] += 1;
+        }
+    }
+    component.registered().any(|image| of_three[image.index()] < ENOUGH_POINTS)
+}
 
 /// Gives points to keypoints of images with few that lie where they ought to be seen and look alike; returns how many.
 ///
