@@ -165,17 +165,31 @@ impl Street {
         let target: Vec<_> = registered.iter().map(|image| self.truth[image.index()].translation).collect();
         let truth_from_world =
             Similarity::from_point_pairs(&source, &target).expect("centres are not collinear");
-        let (mut worst_m, mut turns) = (0.0_f64, Vec::new());
+        let (mut worst_m, mut worst_deg) = (0.0_f64, 0.0_f64);
         for image in &registered {
             let aligned = truth_from_world.transform_pose(&pose(image));
             let truth = &self.truth[image.index()];
             worst_m = worst_m.max((aligned.translation - truth.translation).norm());
-            turns.push((aligned.rotation * truth.rotation.inverse()).scaled_axis());
+            worst_deg = worst_deg.max(aligned.rotation.angle_to(&truth.rotation).to_degrees());
         }
-        // Centres nearly in a line leave the turn about it to their last millimetres: what all have in common is no error.
-        let common = turns.iter().sum::<Vector3<f64>>() / turns.len() as f64;
-        let worst_rad = turns.iter().map(|turn| (turn - common).norm()).fold(0.0, f64::max);
-        (registered.len(), worst_m, worst_rad.to_degrees())
+        (registered.len(), worst_m, worst_deg)
+    }
+
+    /// The largest error in degrees of an image's rotation against the first registered one's: whatever frame it is in.
+    fn relative_rotation_error_deg(&self, output: &MapperOutput) -> f64 {
+        let component = &output.components[0];
+        let rotations: Vec<_> = component
+            .registered()
+            .filter_map(|image| {
+                let found = component.images[image.index()].world_from_camera?;
+                Some((found.rotation, self.truth[image.index()].rotation))
+            })
+            .collect();
+        let (first, first_truth) = rotations[0];
+        let error = |(found, truth): &(UnitQuaternion<f64>, UnitQuaternion<f64>)| {
+            (first.inverse() * found).angle_to(&(first_truth.inverse() * truth)).to_degrees()
+        };
+        rotations.iter().map(error).fold(0.0, f64::max)
     }
 }
 
@@ -240,9 +254,11 @@ fn photos_turned_on_the_spot_are_mapped_as_one_standpoint() {
     });
     let street = Street::new(views.collect(), 0.3, 0, 11);
     let output = street.map(&street.cameras, true);
-    let (registered, center, rotation) = street.errors(&output);
+    let (registered, center, _) = street.errors(&output);
+    // The centres lie within a metre of a line, so a frame aligned by them turns about it by 0.2° for 4 mm.
+    let rotation = street.relative_rotation_error_deg(&output);
     assert_eq!(registered, 12, "{:?}", output.report.registrations);
-    assert!(center < 0.05 && rotation < 0.2, "{center} m, {rotation}°");
+    assert!(center < 0.05 && rotation < 0.1, "{center} m, {rotation}°");
     let poses: Vec<Rigid> =
         output.components[0].images.iter().filter_map(|image| image.world_from_camera).collect();
     for pair in poses.chunks(2) {

@@ -91,10 +91,12 @@ fn seen_again(model: &Model<'_>, image: ImageId, max_error_sigma: f64) -> Vec<(u
     let mut alike: Vec<(u32, u32, PointId)> = Vec::new();
     for id in wanted {
         let Some(point) = model.point(id) else { continue };
-        let known = views_alike(model, point, pose.center());
         let is_seen = point.track.iter().any(|seen| seen.image == image);
-        if is_seen || known.is_empty() || !is_in_view(model, image, &pose.world_from_camera, &point.position)
-        {
+        if is_seen || !is_in_view(model, image, &pose.world_from_camera, &point.position) {
+            continue;
+        }
+        let known = views_alike(model, point, pose.center());
+        if known.is_empty() {
             continue;
         }
         let direction = pose.world_from_camera.inverse_transform_point(&point.position).normalize();
