@@ -2,8 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
-use setloc_features::squared_distance;
+use setloc_features::{NearbyKeypoints, squared_distance};
 use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::{PointId, Rigid};
 
@@ -21,14 +20,7 @@ pub(crate) fn guided_matches(
     nearest: &[NearestPoints],
     world_from_camera: &Rigid,
 ) -> Vec<SceneMatch> {
-    let usable: Vec<u32> =
-        (0..photo.features.len() as u32).filter(|&i| photo.rays.sigmas[i as usize].is_finite()).collect();
-    let bearings: Vec<[f64; 3]> = usable.iter().map(|&i| photo.rays.bearings[i as usize].into()).collect();
-    let Some(tree) =
-        (!bearings.is_empty()).then(|| ImmutableKdTree::<f64, 3>::new_from_slice(&bearings).ok()).flatten()
-    else {
-        return Vec::new();
-    };
+    let keypoints = NearbyKeypoints::new(&photo.rays, |_| true);
     let slack2 = params.slack * params.slack;
     let ratio2 = params.ratio * params.ratio;
     // Per feature the best point: (squared distance, point).
@@ -58,13 +50,8 @@ pub(crate) fn guided_matches(
         if views.is_empty() {
             continue;
         }
-        let query: [f64; 3] = (direction_in_camera / distance).into();
-        let radius = params.radius_px * angle;
-        let found = tree.query(&query).within::<SquaredEuclidean<f64>>(radius * radius).execute();
-        let mut near: Vec<u32> = found.into_iter().map(|item| usable[item.item as usize]).collect();
-        near.sort_unstable();
         let (mut best, mut second) = (None::<(u32, u32)>, u32::MAX);
-        for feature in near {
+        for feature in keypoints.within(&direction_in_camera, params.radius_px * angle) {
             let size = f64::from(photo.features.keypoints[feature as usize].size);
             let descriptor = photo.features.descriptor(feature as usize);
             let distance2 = views

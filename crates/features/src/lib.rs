@@ -12,6 +12,7 @@
 //! | features | [`extract`] | SIFT → RootSIFT bytes, closed over a panorama's seam, spread over the sphere |
 //! | rays | [`ImageFeatures::rays`] | unit bearings with angular standard deviations |
 //! | matches | [`match_features`], [`match_guided`] | exact two nearest neighbours; along epipolar circles once a pose is known |
+//! | neighbours | [`NearbyKeypoints`] | keypoints near a direction of the sphere |
 //! | patches | [`Template::align`] | one place in two images, to a fraction of a pixel |
 //!
 //! Conventions: camera frame x right, y down, z forward; the centre of the first pixel is (0.5, 0.5); radians inside,
@@ -49,6 +50,7 @@ mod features;
 mod geodesy;
 mod mask;
 mod matching;
+mod nearby;
 mod patch;
 mod sift;
 
@@ -66,4 +68,5 @@ pub use matching::{
     DescriptorBlock, GuidedParams, Match, MatchParams, TwoNearest, match_features, match_guided,
     squared_distance, two_nearest,
 };
+pub use nearby::NearbyKeypoints;
 pub use patch::{Aligned, ImagePyramid, Patch, PatchFrame, PatchParams, Template};

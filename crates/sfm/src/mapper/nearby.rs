@@ -1,27 +1,17 @@
 //! Matches of keypoints whose place in the other image is expected.
 
 use nalgebra::Vector3;
-use setloc_features::{ImageFeatures, Match, Rays, squared_distance};
+use setloc_features::{ImageFeatures, Match, NearbyKeypoints, Rays, squared_distance};
 
 /// The keypoints of an image, by their place.
 pub(super) struct Nearby<'a> {
     features: &'a ImageFeatures,
-    rays: &'a Rays,
-    /// Keypoints with a ray, by the first coordinate of their bearings.
-    order: Vec<u32>,
+    keypoints: NearbyKeypoints,
 }
 
 impl<'a> Nearby<'a> {
-    pub fn new(features: &'a ImageFeatures, rays: &'a Rays) -> Self {
-        let mut order: Vec<u32> = (0..features.len() as u32)
-            .filter(|&at| {
-                rays.sigmas[at as usize].is_finite() && rays.bearings[at as usize] != Vector3::zeros()
-            })
-            .collect();
-        order.sort_by(|&a, &b| {
-            rays.bearings[a as usize].x.total_cmp(&rays.bearings[b as usize].x).then(a.cmp(&b))
-        });
-        Self { features, rays, order }
+    pub fn new(features: &'a ImageFeatures, rays: &Rays) -> Self {
+        Self { features, keypoints: NearbyKeypoints::new(rays, |_| true) }
     }
 
     /// The keypoint within `radius_rad` of a direction (any length) that resembles the descriptor most, with its squared
@@ -33,12 +23,8 @@ impl<'a> Nearby<'a> {
         descriptor: &[u8],
         most: u32,
     ) -> Option<(u32, u32)> {
-        let direction = direction.try_normalize(0.0)?;
-        let bearing = |at: u32| &self.rays.bearings[at as usize];
-        let from = self.order.partition_point(|&at| bearing(at).x < direction.x - radius_rad);
-        let near = self.order[from..].iter().take_while(|&&at| bearing(at).x <= direction.x + radius_rad);
-        near.filter(|&&at| (bearing(at) - direction).norm_squared() <= radius_rad * radius_rad)
-            .map(|&at| (squared_distance(descriptor, self.features.descriptor(at as usize)), at))
+        let near = self.keypoints.within(direction, radius_rad).into_iter();
+        near.map(|at| (squared_distance(descriptor, self.features.descriptor(at as usize)), at))
             .filter(|&(distance, _)| distance <= most)
             .min()
             .map(|(distance, at)| (at, distance))

@@ -1,7 +1,6 @@
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use setloc_features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, squared_distance};
+use setloc_features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, NearbyKeypoints, squared_distance};
 
 use super::{
     model::{Model, ModelPoint},
@@ -22,13 +21,18 @@ const MAX_DISTANCE_RATIO: f64 = 3.0;
 
 /// Whether points are worth seeking in any image.
 pub(super) fn has_images_with_few_points(component: &Reconstruction) -> bool {
-    let mut of_three = vec![0_usize; component.images.len()];
-    for point in component.points.iter().filter(|point| point.track.len() > 2) {
-        for seen in &point.track {
-            of_three[seen.image.index()] += 1;
-        }
+    let tracks = component.points.iter().map(|point| &*point.track);
+    let counts = points_of_three(component.images.len(), tracks);
+    component.registered().any(|image| counts[image.index()] < ENOUGH_POINTS)
+}
+
+/// How many of these tracks that three images see each image sees.
+fn points_of_three<'t>(images: usize, tracks: impl Iterator<Item = &'t [Observation]>) -> Vec<usize> {
+    let mut counts = vec![0; images];
+    for seen in tracks.filter(|track| track.len() > 2).flatten() {
+        counts[seen.image.index()] += 1;
     }
-    component.registered().any(|image| of_three[image.index()] < ENOUGH_POINTS)
+    counts
 }
 
 /// Gives points to keypoints of images with few that lie where they ought to be seen and look alike; returns how many.
@@ -46,12 +50,15 @@ pub(super) fn search_by_projection(model: &mut Model<'_>, max_error_sigma: f64) 
     if !images.iter().all(is_described) {
         return 0;
     }
+    let counts = points_of_three(model.poses.len(), model.live_points().map(|(_, point)| &*point.track));
+    let few: Vec<ImageId> =
+        images.into_iter().filter(|image| counts[image.index()] < ENOUGH_POINTS).collect();
     let found: Vec<Vec<(u32, PointId)>> = {
         let model = &*model;
-        images.par_iter().with_max_len(1).map(|&image| seen_again(model, image, max_error_sigma)).collect()
+        few.par_iter().with_max_len(1).map(|&image| seen_again(model, image, max_error_sigma)).collect()
     };
     let mut added = 0;
-    for (&image, found) in images.iter().zip(&found) {
+    for (&image, found) in few.iter().zip(&found) {
         for &(feature, id) in found {
             model.add_observation(id, Observation { image, feature });
             added += 1;
@@ -63,22 +70,12 @@ pub(super) fn search_by_projection(model: &mut Model<'_>, max_error_sigma: f64) 
 /// Free keypoints of an image with the points that they show, both at most once.
 fn seen_again(model: &Model<'_>, image: ImageId, max_error_sigma: f64) -> Vec<(u32, PointId)> {
     let Some(pose) = &model.poses[image.index()] else { return Vec::new() };
-    let of_three = |id: &PointId| model.point(*id).is_some_and(|point| point.track.len() > 2);
-    if model.observations_of(image).iter().filter(|(_, id)| of_three(id)).count() >= ENOUGH_POINTS {
-        return Vec::new();
-    }
     let (features, rays) = (model.input.images[image.index()].features, &model.rays[image.index()]);
-    let is_free = |feature: &u32| {
-        rays.sigmas[*feature as usize].is_finite()
-            && model.point_of(Observation { image, feature: *feature }).is_none()
+    let is_free = |feature: u32| {
+        (feature as usize) < features.own_len() && model.point_of(Observation { image, feature }).is_none()
     };
-    let free: Vec<u32> = (0..features.own_len() as u32).filter(is_free).collect();
-    let bearings: Vec<[f64; 3]> =
-        free.iter().map(|&feature| rays.bearings[feature as usize].into()).collect();
-    let tree =
-        (!bearings.is_empty()).then(|| ImmutableKdTree::<f64, 3>::new_from_slice(&bearings).ok()).flatten();
-    let Some(tree) = tree else { return Vec::new() };
-    let widest = free.iter().map(|&feature| rays.sigmas[feature as usize]).fold(0.0, f64::max);
+    let free = NearbyKeypoints::new(rays, is_free);
+    let widest = free.keypoints().iter().map(|&feature| rays.sigmas[feature as usize]).fold(0.0, f64::max);
     let radius = max_error_sigma * widest;
     let mut wanted: Vec<PointId> = (model.registered_neighbours(image).into_iter())
         .flat_map(|other| model.observations_of(other))
@@ -99,13 +96,12 @@ fn seen_again(model: &Model<'_>, image: ImageId, max_error_sigma: f64) -> Vec<(u
         if known.is_empty() {
             continue;
         }
-        let direction = pose.world_from_camera.inverse_transform_point(&point.position).normalize();
-        let near = tree.query(&direction.into()).within::<SquaredEuclidean<f64>>(radius * radius).execute();
+        let direction = pose.world_from_camera.inverse_transform_point(&point.position);
         let distance = |feature: u32| {
             let descriptor = features.descriptor(feature as usize);
             known.iter().map(|(of, at)| squared_distance(descriptor, of.descriptor(*at))).min()
         };
-        let candidates = near.into_iter().map(|item| free[item.item as usize]).filter(|&feature| {
+        let candidates = free.within(&direction, radius).into_iter().filter(|&feature| {
             let error = model.error_sigma(Observation { image, feature }, &point.position);
             error.is_some_and(|error| error <= max_error_sigma)
         });
