@@ -1,5 +1,7 @@
 //! One configuration: every stage's parameters under its name. Flags override the file, the file the defaults.
 
+mod ranges;
+
 use std::path::Path;
 
 use anyhow::{Context, Result};
@@ -105,10 +107,25 @@ impl Config {
             apply(&mut table, setting)?;
         }
         let text = toml::to_string(&table)?;
-        toml::from_str(&text).map_err(|error| {
+        let config: Self = toml::from_str(&text).map_err(|error| {
             let message = format!("invalid setting: {}", error.message());
             Hinted::error(message, "`setloc build --print-config` lists all keys with their values")
-        })
+        })?;
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// Checks all numbers.
+    ///
+    /// # Errors
+    /// With the key, value and allowed range of each that is out of its range.
+    pub fn validate(&self) -> Result<()> {
+        let violations = ranges::violations(&toml::Table::try_from(self)?);
+        if violations.is_empty() {
+            return Ok(());
+        }
+        let message = format!("invalid setting: {}", violations.join("; "));
+        Err(Hinted::error(message, "`setloc build --print-config` without settings lists the defaults"))
     }
 
     /// The part that a scene depends on, as TOML: without localization.
@@ -179,6 +196,20 @@ mod tests {
         );
         assert!(Config::resolve(None, &["pairs.windw=3".to_owned()]).is_err());
         assert!(Config::resolve(None, &["pairs.window=many".to_owned()]).is_err());
+    }
+
+    #[test]
+    fn numbers_out_of_range_are_named_with_what_is_expected() {
+        let settings = ["two_view.max_iterations=30", "features.sigma_px=nan", "single.guided.ratio=1.5"];
+        let settings = settings.map(str::to_owned);
+        let error = format!("{:#}", Config::resolve(None, &settings).unwrap_err());
+        for part in [
+            "`two_view.max_iterations` is 30, expected 50 to 1000000000",
+            "`features.sigma_px` is NaN, expected 0.5 to 10",
+            "`single.guided.ratio` is 1.5, expected above 0, at most 1",
+        ] {
+            assert!(error.contains(part), "{error}");
+        }
     }
 
     #[test]

@@ -285,11 +285,10 @@ impl<'a> Tracks<'a> {
             camera.project(&camera_from_world.transform_point(&(position + on_plane)))
         };
         let middle = place(0.0, 0.0)?;
-        let width = f64::from(camera.width);
         let from_middle = |x: f64, y: f64| {
             let mut offset = place(x, y)? - middle;
-            if camera.is_panoramic() {
-                offset.x -= width * (offset.x / width).round();
+            if let Some(turn) = camera.full_turn_px() {
+                offset.x -= turn * (offset.x / turn).round();
             }
             Some(offset)
         };

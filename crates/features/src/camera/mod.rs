@@ -208,7 +208,12 @@ impl Camera {
 
     /// Whether the left and the right border of the image are neighbours on the sphere.
     pub fn wraps_around(&self) -> bool {
-        self.is_panoramic() && self.params.first().is_some_and(|&full| full == f64::from(self.width))
+        self.full_turn_px() == Some(f64::from(self.width))
+    }
+
+    /// Width in pixels of the whole turn of a panorama, of which the image may be a crop; `None` for photos.
+    pub fn full_turn_px(&self) -> Option<f64> {
+        self.params.first().copied().filter(|_| self.is_panoramic())
     }
 
     /// The mean focal length in pixels; for panoramas the pixels per radian at the horizon.

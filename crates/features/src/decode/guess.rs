@@ -85,7 +85,9 @@ fn panorama(info: &ImageInfo, gpano: &GPano) -> Camera {
     let (width, height) = (f64::from(info.width), f64::from(info.height));
     let full = Camera::equirectangular(info.width, info.height);
     let crop = |params: [f64; 4]| {
-        if params == [width, height, 0.0, 0.0] {
+        // Sizes that were scaled do not come back to the last bit.
+        let is_full = params.iter().zip([width, height, 0.0, 0.0]).all(|(a, b)| (a - b).abs() < 0.5);
+        if is_full {
             return full.clone();
         }
         Camera { model: CameraModel::Equirectangular, params: params.to_vec(), ..full.clone() }

@@ -251,6 +251,12 @@ fn gpano_is_read_from_attributes_and_elements() {
     let (camera, source) = guess_camera(&ImageInfo { width: 3000, height: 1500, metadata });
     assert_eq!(source, CameraSource::GPano);
     assert_eq!(camera.params, [4000.0, 2000.0, 500.0, 200.0]);
+    // Scaled by a factor that has no exact binary fraction: still all round.
+    let whole = GPano { full_width: Some(11000.0), full_height: Some(5500.0), ..GPano::default() };
+    let metadata = ImageMetadata { gpano: Some(whole), ..ImageMetadata::default() };
+    let (camera, _) = guess_camera(&ImageInfo { width: 4096, height: 2048, metadata });
+    assert_eq!(camera, Camera::equirectangular(4096, 2048));
+    assert!(camera.wraps_around());
     assert_eq!(gpano(r#"GPano:ProjectionType="cylindrical""#), None);
     assert_eq!(gpano("no such thing"), None);
 }

@@ -71,8 +71,9 @@ impl MatchParams {
     /// Changes whenever the same parameters and features give other matches.
     ///
     /// 1: exact two nearest neighbours, ratio and mutual test.
-    /// 2: bright and dark spots apart, screened by the strongest. 3: simulated views.
-    pub const VERSION: u32 = 3;
+    /// 2: bright and dark spots apart, screened by the strongest. 3: simulated views. 4: which do not count among those
+    /// that are worth screening.
+    pub const VERSION: u32 = 4;
 
     /// Checks the ranges.
     ///
@@ -130,7 +131,7 @@ pub fn match_features(params: &MatchParams, first: &ImageFeatures, second: &Imag
     let parts = |features: &ImageFeatures, most: usize| {
         features.parts().map(|part| part.start..part.end.min(part.start.saturating_add(most)))
     };
-    let worth_screening = |features: &ImageFeatures| features.len() >= 4 * params.screen_features;
+    let worth_screening = |features: &ImageFeatures| features.own_len() >= 4 * params.screen_features;
     if params.screen_features > 0 && worth_screening(first) && worth_screening(second) {
         let [first_parts, second_parts] =
             [first, second].map(|features| parts(features, params.screen_features));
@@ -259,6 +260,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
+    use crate::SimulatedView;
 
     fn features(descriptors: Vec<u8>) -> ImageFeatures {
         let keypoints = vec![bytemuck::Zeroable::zeroed(); count(&descriptors)];
@@ -342,6 +344,17 @@ mod tests {
         assert_eq!(match_features(&params, &first, &other).len(), 0);
         let all = MatchParams { screen_features: 0, ..params };
         assert_eq!(match_features(&all, &first, &other).len(), 50);
+        // Simulated views do not count among what is worth screening: they may be all that two images share.
+        let viewed = |own: &[u8], simulated: &[u8]| {
+            let mut features = features([own, simulated].concat());
+            features.simulated = vec![SimulatedView { start: 50, light: 0 }];
+            for (at, keypoint) in features.keypoints.iter_mut().enumerate() {
+                keypoint.x = 10.0 * at as f32;
+            }
+            features
+        };
+        let found = match_features(&params, &viewed(&weak, &strong), &viewed(&strong, &weak));
+        assert_eq!(found.len(), 100);
     }
 
     #[test]

@@ -216,7 +216,7 @@ fn stopping_iteration(params: &RansacParams, inlier_ratio: f64, sample_size: usi
     let success = inlier_ratio.powi(sample_size as i32);
     let needed = if success >= 1.0 { 0.0 } else { (1.0 - params.confidence).ln() / (-success).ln_1p() };
     // The cast saturates, also for the infinity of a ratio of zero.
-    (needed.ceil() as u32).clamp(params.min_iterations, params.max_iterations)
+    (needed.ceil() as u32).max(params.min_iterations).min(params.max_iterations)
 }
 
 /// `N` different numbers below `count`, which must be at least `N`.
