@@ -34,80 +34,128 @@ pub struct Georegistration {
     pub residuals: Vec<(ImageId, f64, bool)>,
 }
 
+/// A measured position in local east-north-up metres.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct MeasuredPosition {
+    /// East, north, up.
+    pub enu: Vector3<f64>,
+    /// Whether the height was measured; else it stands for none.
+    pub has_height: bool,
+}
+
 /// Finds the similarity that maps camera centres onto measured positions, ignoring wrong measurements.
 ///
 /// A street is often close to a line, and then noise in the measurements would decide the roll about it. So the mean
-/// up direction of the `upright` images (panorama rigs stand or hang level) fixes roll and pitch whenever the
-/// measurements do not spread sideways by more than their own noise. `None` with fewer than 3 measured images, or 2
-/// where an up direction is known.
+/// up direction of the `upright` images (panorama rigs stand or hang level) fixes roll and pitch wherever the
+/// measurements that agree do not spread sideways by more than their own noise, or lack a height. `None` with fewer than
+/// 3 measured images, or 2 where an up direction is known.
 pub fn georegister(
     params: &GeoregisterParams,
     reconstruction: &Reconstruction,
-    measured: &[Option<Vector3<f64>>],
+    measured: &[Option<MeasuredPosition>],
     upright: &[bool],
     seed: u64,
 ) -> Option<Georegistration> {
     let up_in_world = mean_up(reconstruction, upright);
-    let pairs: Vec<(ImageId, Vector3<f64>, Vector3<f64>)> = reconstruction
+    let pairs: Vec<Pair> = reconstruction
         .registered()
         .filter_map(|image| {
             let center = reconstruction.images[image.index()].world_from_camera?.translation;
-            Some((image, center, (*measured.get(image.index())?)?))
+            Some(Pair { image, center, measured: (*measured.get(image.index())?)? })
         })
         .collect();
-    if pairs.len() < if up_in_world.is_some() { 2 } else { 3 } {
-        return None;
-    }
-    let targets: Vec<Vector3<f64>> = pairs.iter().map(|pair| pair.2).collect();
-    let level = up_in_world.filter(|_| sideways_spread(&targets) < SPREAD_OF_NOISE * params.gps_sigma_m);
-    let error = |similarity: &Similarity, pair: &(ImageId, Vector3<f64>, Vector3<f64>)| {
-        let mut offset = similarity.transform_point(&pair.1) - pair.2;
-        offset.z /= params.height_factor;
-        offset.norm() / params.gps_sigma_m
-    };
-    let fit = |chosen: &[usize]| {
-        let source: Vec<_> = chosen.iter().map(|&index| pairs[index].1).collect();
-        let target: Vec<_> = chosen.iter().map(|&index| pairs[index].2).collect();
-        match &level {
-            Some(up) => fit_upright(up, &source, &target),
-            None => Similarity::from_point_pairs(&source, &target),
-        }
-    };
-    let score = |similarity: &Similarity| -> f64 {
-        pairs.iter().map(|pair| error(similarity, pair).powi(2).min(params.max_error_sigma.powi(2))).sum()
-    };
-    let agreeing = |similarity: &Similarity| -> Vec<usize> {
-        (0..pairs.len()).filter(|&index| error(similarity, &pairs[index]) <= params.max_error_sigma).collect()
-    };
-
-    // Three noisy neighbours leave the tilt of the whole free, so larger samples and the fit to all compete.
-    let all: Vec<usize> = (0..pairs.len()).collect();
-    let mut best = fit(&all)?;
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    for _ in 0..500 {
-        let size = rng.random_range(pairs.len().min(3)..=pairs.len().min(8));
-        let sample = rand::seq::index::sample(&mut rng, pairs.len(), size).into_vec();
-        if let Some(candidate) = fit(&sample)
-            && score(&candidate) < score(&best)
-        {
-            best = candidate;
-        }
-    }
-    for _ in 0..10 {
-        let chosen = agreeing(&best);
-        match fit(&chosen) {
-            Some(refined) if score(&refined) < score(&best) => best = refined,
-            _ => break,
-        }
-    }
+    let alignment = Alignment { params, pairs: &pairs };
+    let free = alignment.robust(3, seed, |pairs| {
+        let (source, target): (Vec<_>, Vec<_>) =
+            pairs.iter().map(|pair| (pair.center, pair.measured.enu)).unzip();
+        Similarity::from_point_pairs(&source, &target)
+    });
+    let level = up_in_world.and_then(|up| {
+        let free = free.filter(|_| pairs.iter().all(|pair| pair.measured.has_height));
+        let agreeing = free.map(|free| alignment.agreeing(&free)).unwrap_or_default();
+        let agreeing: Vec<Vector3<f64>> = agreeing.iter().map(|&at| pairs[at].measured.enu).collect();
+        let on_a_line = sideways_spread(&agreeing) < SPREAD_OF_NOISE * params.gps_sigma_m;
+        if on_a_line { alignment.robust(2, seed, |pairs| fit_upright(&up, pairs)) } else { None }
+    });
+    let best = level.or(free)?;
     let residuals = pairs
         .iter()
         .map(|pair| {
-            let distance = (best.transform_point(&pair.1) - pair.2).norm();
-            (pair.0, distance, error(&best, pair) <= params.max_error_sigma)
+            let mut offset = best.transform_point(&pair.center) - pair.measured.enu;
+            if !pair.measured.has_height {
+                offset.z = 0.0;
+            }
+            (pair.image, offset.norm(), alignment.error(&best, pair) <= params.max_error_sigma)
         })
         .collect();
     Some(Georegistration { enu_from_world: best, residuals })
+}
+
+/// An image's centre in the component's frame and where it was measured.
+struct Pair {
+    image: ImageId,
+    center: Vector3<f64>,
+    measured: MeasuredPosition,
+}
+
+struct Alignment<'a> {
+    params: &'a GeoregisterParams,
+    pairs: &'a [Pair],
+}
+
+impl Alignment<'_> {
+    /// In standard deviations.
+    fn error(&self, similarity: &Similarity, pair: &Pair) -> f64 {
+        let mut offset = similarity.transform_point(&pair.center) - pair.measured.enu;
+        offset.z *= if pair.measured.has_height { self.params.height_factor.recip() } else { 0.0 };
+        offset.norm() / self.params.gps_sigma_m
+    }
+
+    fn score(&self, similarity: &Similarity) -> f64 {
+        let most = self.params.max_error_sigma.powi(2);
+        self.pairs.iter().map(|pair| self.error(similarity, pair).powi(2).min(most)).sum()
+    }
+
+    /// Pairs whose measurement agrees, by their places in the list.
+    fn agreeing(&self, similarity: &Similarity) -> Vec<usize> {
+        let agrees = |&at: &usize| self.error(similarity, &self.pairs[at]) <= self.params.max_error_sigma;
+        (0..self.pairs.len()).filter(agrees).collect()
+    }
+
+    /// The best of fits to samples of at least `least` pairs and to all, refined on what agrees.
+    ///
+    /// Three noisy neighbours leave the tilt of the whole free, so larger samples and the fit to all compete.
+    fn robust(
+        &self,
+        least: usize,
+        seed: u64,
+        fit: impl Fn(&[&Pair]) -> Option<Similarity>,
+    ) -> Option<Similarity> {
+        let count = self.pairs.len();
+        if count < least {
+            return None;
+        }
+        let fit = |chosen: &[usize]| fit(&chosen.iter().map(|&at| &self.pairs[at]).collect::<Vec<_>>());
+        let all: Vec<usize> = (0..count).collect();
+        let mut best = fit(&all)?;
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        for _ in 0..500 {
+            let size = rng.random_range(count.min(3)..=count.min(8));
+            let sample = rand::seq::index::sample(&mut rng, count, size).into_vec();
+            if let Some(candidate) = fit(&sample)
+                && self.score(&candidate) < self.score(&best)
+            {
+                best = candidate;
+            }
+        }
+        for _ in 0..10 {
+            match fit(&self.agreeing(&best)) {
+                Some(refined) if self.score(&refined) < self.score(&best) => best = refined,
+                _ => break,
+            }
+        }
+        Some(best)
+    }
 }
 
 /// Sideways spread of the measurements, in standard deviations of one, below which they do not fix the tilt.
@@ -134,22 +182,27 @@ fn sideways_spread(points: &[Vector3<f64>]) -> f64 {
     (spread[1] / points.len().max(1) as f64).sqrt()
 }
 
-/// Least-squares similarity with the up direction given: yaw and scale from horizontal offsets, then translation.
-fn fit_upright(
-    up_in_world: &Vector3<f64>,
-    source: &[Vector3<f64>],
-    target: &[Vector3<f64>],
-) -> Option<Similarity> {
+/// Least-squares similarity with the up direction given: yaw and scale from horizontal offsets, then translation, its
+/// height from what was measured with one.
+fn fit_upright(up_in_world: &Vector3<f64>, pairs: &[&Pair]) -> Option<Similarity> {
     let level = UnitQuaternion::rotation_between(up_in_world, &Vector3::z())
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
-    let n = source.len() as f64;
-    let source: Vec<Vector3<f64>> = source.iter().map(|point| level * point).collect();
-    let source_mean = source.iter().sum::<Vector3<f64>>() / n;
-    let target_mean = target.iter().sum::<Vector3<f64>>() / n;
+    let placed: Vec<(Vector3<f64>, MeasuredPosition)> =
+        pairs.iter().map(|pair| (level * pair.center, pair.measured)).collect();
+    let means = |wanted: &dyn Fn(&MeasuredPosition) -> bool| {
+        let (mut source, mut target, mut count) = (Vector3::zeros(), Vector3::zeros(), 0.0);
+        for (center, measured) in placed.iter().filter(|(_, measured)| wanted(measured)) {
+            source += center;
+            target += measured.enu;
+            count += 1.0;
+        }
+        (count > 0.0).then(|| (source / count, target / count))
+    };
+    let (source_mean, target_mean) = means(&|_| true)?;
     // As complex numbers: target = (scale · e^{i·yaw}) · source.
     let (mut real, mut imaginary, mut variance) = (0.0, 0.0, 0.0);
-    for (a, b) in source.iter().zip(target) {
-        let (a, b) = (a - source_mean, b - target_mean);
+    for (center, measured) in &placed {
+        let (a, b) = (center - source_mean, measured.enu - target_mean);
         real += a.x * b.x + a.y * b.y;
         imaginary += a.x * b.y - a.y * b.x;
         variance += a.x * a.x + a.y * a.y;
@@ -159,7 +212,11 @@ fn fit_upright(
         return None;
     }
     let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), imaginary.atan2(real));
-    Some(Similarity { scale, rotation: yaw * level, translation: target_mean - yaw * source_mean * scale })
+    let mut translation = target_mean - yaw * source_mean * scale;
+    if let Some((source, target)) = means(&|measured| measured.has_height) {
+        translation.z = target.z - scale * source.z;
+    }
+    Some(Similarity { scale, rotation: yaw * level, translation })
 }
 
 #[cfg(test)]
@@ -167,7 +224,12 @@ mod tests {
     use super::*;
     use crate::{CameraId, ReconstructionImage, Rigid};
 
-    fn street(n: usize) -> (Reconstruction, Vec<Option<Vector3<f64>>>, Similarity) {
+    /// A measurement with a height.
+    fn at(enu: Vector3<f64>) -> Option<MeasuredPosition> {
+        Some(MeasuredPosition { enu, has_height: true })
+    }
+
+    fn street(n: usize) -> (Reconstruction, Vec<Option<MeasuredPosition>>, Similarity) {
         let truth = Similarity {
             scale: 2.5,
             rotation: UnitQuaternion::from_euler_angles(0.2, -0.4, 1.9),
@@ -186,7 +248,7 @@ mod tests {
                 world_from_camera,
             });
             let noise = Vector3::from_fn(|_, _| rng.random_range(-1.0..1.0));
-            measured.push(Some(truth.transform_point(&center) + noise));
+            measured.push(at(truth.transform_point(&center) + noise));
         }
         (reconstruction, measured, truth)
     }
@@ -194,8 +256,8 @@ mod tests {
     #[test]
     fn survives_wrong_measurements_and_names_them() {
         let (reconstruction, mut measured, truth) = street(20);
-        measured[3] = Some(Vector3::new(500.0, 0.0, 0.0));
-        measured[11] = Some(Vector3::new(0.0, -300.0, 40.0));
+        measured[3] = at(Vector3::new(500.0, 0.0, 0.0));
+        measured[11] = at(Vector3::new(0.0, -300.0, 40.0));
         let found = georegister(&GeoregisterParams::default(), &reconstruction, &measured, &[], 1).unwrap();
         for (image, distance, agrees) in &found.residuals {
             assert_eq!(*agrees, ![3, 11].contains(&image.0), "{image:?} {distance}");
@@ -204,9 +266,9 @@ mod tests {
         assert!(found.enu_from_world.rotation.angle_to(&truth.rotation) < 0.1);
     }
 
-    #[test]
-    fn a_straight_street_takes_its_tilt_from_upright_cameras_only() {
-        let (mut reconstruction, _, truth) = street(6);
+    /// Upright cameras in a straight row, where they were measured, and the truth.
+    fn straight_row(n: usize) -> (Reconstruction, Vec<Option<MeasuredPosition>>, Similarity) {
+        let (mut reconstruction, _, truth) = street(n);
         let up_in_world = truth.rotation.inverse_transform_vector(&Vector3::z());
         let mut measured = Vec::new();
         for (index, image) in reconstruction.images.iter_mut().enumerate() {
@@ -214,12 +276,60 @@ mod tests {
                 truth.rotation.inverse_transform_vector(&Vector3::new(index as f64, 0.3 * index as f64, 0.0));
             let upright = UnitQuaternion::rotation_between(&-Vector3::y(), &up_in_world).unwrap();
             image.world_from_camera = Some(Rigid::new(upright, center));
-            measured.push(Some(truth.transform_point(&center)));
+            measured.push(at(truth.transform_point(&center)));
         }
+        (reconstruction, measured, truth)
+    }
+
+    #[test]
+    fn a_straight_street_takes_its_tilt_from_upright_cameras_only() {
+        let (reconstruction, measured, truth) = straight_row(6);
         let params = GeoregisterParams::default();
         assert_eq!(georegister(&params, &reconstruction, &measured, &[], 1), None);
         let found = georegister(&params, &reconstruction, &measured, &[true; 6], 1).unwrap();
         assert!(found.enu_from_world.rotation.angle_to(&truth.rotation) < 1e-9);
         assert!((found.enu_from_world.scale / truth.scale - 1.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn one_wrong_measurement_beside_a_straight_street_does_not_tilt_it() {
+        let (reconstruction, mut measured, truth) = straight_row(12);
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        for position in measured.iter_mut().flatten() {
+            position.enu += Vector3::from_fn(|_, _| rng.random_range(-2.0..2.0));
+        }
+        measured[4] = at(Vector3::new(300.0, -250.0, 30.0));
+        let found = georegister(&GeoregisterParams::default(), &reconstruction, &measured, &[true; 12], 1);
+        let found = found.unwrap();
+        let tilt =
+            (found.enu_from_world.rotation * truth.rotation.inverse() * Vector3::z()).angle(&Vector3::z());
+        assert!(tilt < 1e-9, "{tilt}");
+        let disagreeing: Vec<u32> =
+            found.residuals.iter().filter(|(.., agrees)| !agrees).map(|(image, ..)| image.0).collect();
+        assert_eq!(disagreeing, [4]);
+    }
+
+    #[test]
+    fn unknown_heights_neither_tilt_nor_disagree() {
+        // A wide scene on a slope: with heights of zero it would be laid flat.
+        let (mut reconstruction, _, truth) = street(16);
+        let up_in_world = truth.rotation.inverse_transform_vector(&Vector3::z());
+        let upright = UnitQuaternion::rotation_between(&-Vector3::y(), &up_in_world).unwrap();
+        let mut measured = Vec::new();
+        for (index, image) in reconstruction.images.iter_mut().enumerate() {
+            let (x, y) = ((index % 4) as f64 * 30.0, (index / 4) as f64 * 30.0);
+            let enu = Vector3::new(x, y, 0.3 * x);
+            let center = truth.inverse().transform_point(&enu);
+            image.world_from_camera = Some(Rigid::new(upright, center));
+            let has_height = index % 3 == 0;
+            measured.push(Some(MeasuredPosition {
+                enu: if has_height { enu } else { Vector3::new(x, y, 0.0) },
+                has_height,
+            }));
+        }
+        let found = georegister(&GeoregisterParams::default(), &reconstruction, &measured, &[true; 16], 1);
+        let found = found.unwrap();
+        assert!(found.residuals.iter().all(|(.., agrees)| *agrees));
+        assert!(found.enu_from_world.rotation.angle_to(&truth.rotation) < 1e-9);
     }
 }

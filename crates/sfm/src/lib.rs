@@ -20,7 +20,7 @@ mod visibility;
 
 pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, align_tracks};
 pub use geometry::{Rigid, Similarity};
-pub use georegister::{GeoregisterParams, Georegistration, georegister};
+pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, georegister};
 pub use mapper::{
     InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,
     MergeVerdict, Mosaic, PutativePair, RegistrationRecord, reconstruct,

@@ -5,13 +5,12 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
-use nalgebra::Vector3;
 use serde_json::json;
 use setloc_features::{Camera, ImageFeatures, Match};
 use setloc_sfm::{
-    CameraId, GeoregisterParams, ImageId, InputImage, MapperInput, MapperParams, MapperReport, PairGeometry,
-    PutativePair, QualityParams, Reconstruction, TwoViewParams, assess, georegister, reconstruct,
-    verify_pair,
+    CameraId, GeoregisterParams, ImageId, InputImage, MapperInput, MapperParams, MapperReport,
+    MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction, TwoViewParams, assess,
+    georegister, reconstruct, verify_pair,
 };
 
 use super::alignment::add_alignment;
@@ -47,7 +46,7 @@ pub struct ModelSource<'a> {
     /// The image files.
     pub images: &'a [SourceImage],
     /// Measured positions, one an image.
-    pub positions: &'a [Option<Vector3<f64>>],
+    pub positions: &'a [Option<MeasuredPosition>],
     /// Pairs to match, as indices into `images`.
     pub pairs: &'a [(usize, usize)],
 }
@@ -275,7 +274,7 @@ struct ModelConfig {
 
 struct ModelInput<'a> {
     cameras: &'a SharedCameras,
-    positions: &'a [Option<Vector3<f64>>],
+    positions: &'a [Option<MeasuredPosition>],
     pairs: &'a [(usize, usize, bool)],
 }
 
@@ -311,12 +310,13 @@ fn run_model(
     }
     let names: Vec<String> = features.iter().map(|(at, _)| place_holder(*at)).collect();
     let images = features.iter().zip(&names).map(|((at, features), name)| InputImage {
-        position_prior: input.positions[*at],
+        position_prior: input.positions[*at].map(|measured| measured.enu),
         ..InputImage::new(name, CameraId(input.cameras.of_image[*at] as u32), features)
     });
     let images = images.collect();
     let (cameras, camera_fixed) = (input.cameras.cameras.clone(), input.cameras.fixed.clone());
-    let positions: Vec<Option<Vector3<f64>>> = features.iter().map(|(at, _)| input.positions[*at]).collect();
+    let positions: Vec<Option<MeasuredPosition>> =
+        features.iter().map(|(at, _)| input.positions[*at]).collect();
     let input_of_mapper = MapperInput {
         cameras,
         camera_fixed,
@@ -348,7 +348,7 @@ fn place(
     report: &mut MapperReport,
     params: &GeoregisterParams,
     component: &mut Reconstruction,
-    positions: &[Option<Vector3<f64>>],
+    positions: &[Option<MeasuredPosition>],
     is_main: bool,
     seed: u64,
 ) {

@@ -1,11 +1,11 @@
 use std::collections::BTreeSet;
 
-use nalgebra::Vector3;
+use setloc_sfm::MeasuredPosition;
 
 use crate::config::PairParams;
 
 /// Which pairs to match, as sorted index pairs `(a, b)` with `a < b`.
-pub fn choose_pairs(params: &PairParams, positions: &[Option<Vector3<f64>>]) -> Vec<(usize, usize)> {
+pub fn choose_pairs(params: &PairParams, positions: &[Option<MeasuredPosition>]) -> Vec<(usize, usize)> {
     let count = positions.len();
     let mut pairs = BTreeSet::new();
     if count <= params.exhaustive_up_to {
@@ -15,7 +15,7 @@ pub fn choose_pairs(params: &PairParams, positions: &[Option<Vector3<f64>>]) -> 
     for a in 0..count {
         pairs.extend((a + 1..count.min(a + 1 + params.window)).map(|b| (a, b)));
         let Some(here) = positions[a] else { continue };
-        let distance = |b: usize| positions[b].map(|there| (there - here).norm());
+        let distance = |b: usize| positions[b].map(|there| (there.enu - here.enu).norm());
         let mut near: Vec<(f64, usize)> =
             (0..count).filter(|&b| b != a).filter_map(|b| Some((distance(b)?, b))).collect();
         near.sort_by(|x, y| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1)));
@@ -26,6 +26,8 @@ pub fn choose_pairs(params: &PairParams, positions: &[Option<Vector3<f64>>]) -> 
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector3;
+
     use super::*;
 
     #[test]
@@ -36,7 +38,9 @@ mod tests {
     #[test]
     fn large_sets_grow_linearly() {
         let params = PairParams { exhaustive_up_to: 10, window: 2, nearest: 3 };
-        let line = |n: usize| (0..n).map(|i| Some(Vector3::new(i as f64, 0.0, 0.0))).collect::<Vec<_>>();
+        let at =
+            |i: usize| Some(MeasuredPosition { enu: Vector3::new(i as f64, 0.0, 0.0), has_height: true });
+        let line = |n: usize| (0..n).map(at).collect::<Vec<_>>();
         let (small, large) =
             (choose_pairs(&params, &line(100)).len(), choose_pairs(&params, &line(200)).len());
         assert!(large <= 2 * small + 10, "{small} {large}");

@@ -1,12 +1,11 @@
 use std::collections::BTreeMap;
 
 use anyhow::Result;
-use nalgebra::Vector3;
 use rayon::prelude::*;
 use serde_json::json;
 use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::{MapperOutput, MergeRecord, Reconstruction, ReconstructionImage};
+use setloc_sfm::{MapperOutput, MeasuredPosition, MergeRecord, Reconstruction, ReconstructionImage};
 
 use super::choose_pairs;
 use super::model::{ModelKind, ModelSource, add_model, features_role, image_of_place_holder, with_names};
@@ -40,11 +39,13 @@ pub fn add_scene(
     seed: u64,
 ) -> Result<SceneJobs> {
     let origin = origin_of(images);
-    let position = |image: &SourceImage| Some(image.position?.to_enu(origin?));
-    let listed: Vec<Option<Vector3<f64>>> = images.iter().map(position).collect();
+    let position = |image: &SourceImage| {
+        Some(MeasuredPosition { enu: image.position?.to_enu(origin?), has_height: true })
+    };
+    let listed: Vec<Option<MeasuredPosition>> = images.iter().map(position).collect();
     let (order, pairs) = by_content(images, &choose_pairs(&config.pairs, &listed));
     let images: Vec<SourceImage> = order.iter().map(|&at| images[at].clone()).collect();
-    let positions: Vec<Option<Vector3<f64>>> = order.iter().map(|&at| listed[at]).collect();
+    let positions: Vec<Option<MeasuredPosition>> = order.iter().map(|&at| listed[at]).collect();
     let source = ModelSource { images: &images, positions: &positions, pairs: &pairs };
     let jobs = add_model(graph, ModelKind::Scene, "scene", source, config, seed)?;
     let index_params = config.index.clone();
@@ -192,9 +193,23 @@ fn named(model: &Reconstruction, names: &[String]) -> Reconstruction {
     model
 }
 
-/// The mean of the measured positions.
+/// The middle of the measured positions, coordinate by coordinate: a wrong one hardly moves it.
 fn origin_of(images: &[SourceImage]) -> Option<Wgs84> {
     let places: Vec<Wgs84> = images.iter().filter_map(|image| image.position).collect();
-    let mean = |value: fn(&Wgs84) -> f64| places.iter().map(value).sum::<f64>() / places.len() as f64;
-    (!places.is_empty()).then(|| Wgs84 { lat: mean(|p| p.lat), lon: mean(|p| p.lon), alt: mean(|p| p.alt) })
+    let first = places.first()?.lon;
+    // About the first, across the date line too.
+    let from_first = |place: &Wgs84| (place.lon - first + 180.0).rem_euclid(360.0) - 180.0;
+    let lon = middle(places.iter().map(from_first))? + first;
+    Some(Wgs84 {
+        lat: middle(places.iter().map(|place| place.lat))?,
+        lon: (lon + 180.0).rem_euclid(360.0) - 180.0,
+        alt: middle(places.iter().map(|place| place.alt))?,
+    })
+}
+
+/// The lower median.
+fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut values: Vec<f64> = values.collect();
+    let at = values.len().checked_sub(1)? / 2;
+    Some(*values.select_nth_unstable_by(at, f64::total_cmp).1)
 }
