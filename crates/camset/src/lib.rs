@@ -44,5 +44,5 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// planes tell hold the set's baselines. 11: matches far astray are no noise. 13: photos of one standpoint are judged by
 /// what any of them sees. 14: photos stand where their pair by planes has them, as well as that tells.
 /// 15: only matches hundreds of deviations off are no noise. 16: what points do not localize is matched with the scene's
-/// images. 17, 18: by fewer matches a pair, all photos alike.
-pub const VERSION: u32 = 18;
+/// images. 17, 18: by fewer matches a pair, all photos alike. 19: contradictions are named, advice goes with the answers.
+pub const VERSION: u32 = 19;

@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use setloc_sfm::{CameraId, ImageId, Reconstruction, ReconstructionImage, Rigid};
 
-use crate::advice::widest_paths;
+use crate::advice::{Link, widest_paths};
 use crate::{
     CamsetParams, PhotoLocalization, QueryPhoto, Scene, SetLocalization, SingleLocalization, Verdict, Views,
     verdict::standard_deviations,
@@ -42,21 +42,58 @@ pub fn locate_set<E>(
     let photos = &photos[..photos.len().min(alone.len())];
     let evidence = &alone[..photos.len()];
     let by_points = locate_by(params, scene, (photos, evidence), local_models, &Views::default(), seed);
-    if by_points.refined.iter().all(|photo| photo.verdict == Verdict::Localized) {
-        return Ok(by_points);
+    if by_points.set.refined.iter().all(|photo| photo.verdict == Verdict::Localized) {
+        return Ok(by_points.finished());
     }
     let views = views()?;
     if views.matches.is_empty() {
-        return Ok(by_points);
+        return Ok(by_points.finished());
     }
     let by_views = locate_by(params, scene, (photos, evidence), local_models, &views, seed);
-    Ok(better_of(by_points, by_views))
+    Ok(better_of(by_points, by_views).finished())
+}
+
+/// What was found of a set, not yet in words.
+#[derive(Debug, Clone, PartialEq, Default)]
+struct Answer {
+    /// Advice and contradictions are still empty.
+    set: SetLocalization,
+    remarks: Vec<Remark>,
+    /// Whether each photo, localized alone, stands elsewhere.
+    elsewhere: Vec<bool>,
+}
+
+/// What is to be said of a local model.
+#[derive(Debug, Clone, PartialEq)]
+struct Remark {
+    members: Vec<usize>,
+    /// Whether it says that the model is not localized.
+    is_refusal: bool,
+    text: String,
+}
+
+impl Answer {
+    /// With contradictions and advice: what happened to each model, then what to do about each photo that is not localized.
+    fn finished(self) -> SetLocalization {
+        let Self { mut set, remarks, elsewhere } = self;
+        let is_localized = |photo: &usize| set.refined[*photo].verdict == Verdict::Localized;
+        let holds = |remark: &Remark| !(remark.is_refusal && remark.members.iter().all(is_localized));
+        set.advice = remarks.into_iter().filter(holds).map(|remark| remark.text).collect();
+        for (photo, path) in set.refined.iter().zip(&set.paths) {
+            if photo.verdict != Verdict::Localized {
+                set.advice.push(path.advice());
+            }
+        }
+        let contradicted = set.refined.iter().zip(elsewhere).filter(|(_, elsewhere)| *elsewhere);
+        set.contradicted = contradicted.map(|(photo, _)| photo.name.clone()).collect();
+        set
+    }
 }
 
 /// The second answer, which knows more, where anything is localized better in it, but for photos that the first localizes
 /// better; the first altogether where they contradict each other.
-fn better_of(first: SetLocalization, second: SetLocalization) -> SetLocalization {
-    let pairs = || first.refined.iter().zip(&second.refined);
+fn better_of(first: Answer, second: Answer) -> Answer {
+    let pairs = || first.set.refined.iter().zip(&second.set.refined);
     let is_localized = |photo: &PhotoLocalization| photo.verdict == Verdict::Localized;
     let contradicts = |(a, b): (&PhotoLocalization, &PhotoLocalization)| {
         let (Some(of_a), Some(of_b)) = (a.world_from_camera, b.world_from_camera) else { return false };
@@ -71,10 +108,17 @@ fn better_of(first: SetLocalization, second: SetLocalization) -> SetLocalization
         return first;
     }
     let mut best = second;
-    let kept = best.refined.iter_mut().chain(&mut best.rigid);
-    for (kept, other) in kept.zip(first.refined.into_iter().chain(first.rigid)) {
-        if rank(other.verdict) > rank(kept.verdict) {
-            *kept = other;
+    let Answer { set: first, elsewhere, .. } = first;
+    for (at, refined) in first.refined.into_iter().enumerate() {
+        if rank(refined.verdict) > rank(best.set.refined[at].verdict) {
+            best.set.refined[at] = refined;
+            best.set.paths[at] = first.paths[at].clone();
+            best.elsewhere[at] = elsewhere[at];
+        }
+    }
+    for (kept, rigid) in best.set.rigid.iter_mut().zip(first.rigid) {
+        if rank(rigid.verdict) > rank(kept.verdict) {
+            *kept = rigid;
         }
     }
     best
@@ -90,8 +134,9 @@ fn locate_by(
     local_models: &[Reconstruction],
     views: &Views,
     seed: u64,
-) -> SetLocalization {
-    let mut answer = SetLocalization::default();
+) -> Answer {
+    let (mut answer, mut remarks) = (SetLocalization::default(), Vec::new());
+    let mut elsewhere = vec![false; photos.len()];
     let mut rigid: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut refined: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut scene_links: Vec<usize> =
@@ -116,17 +161,20 @@ fn locate_by(
                 for (slot, &photo) in members.iter().enumerate() {
                     scene_links[photo] = scene_links[photo].max(found.scene_points[slot]);
                     keep_better(&mut rigid[photo], found.rigid[slot].clone());
-                    keep_better(&mut refined[photo], found.refined[slot].clone());
+                    if keep_better(&mut refined[photo], found.refined[slot].clone()) {
+                        elsewhere[photo] = found.elsewhere[slot];
+                    }
                 }
-                answer.advice.extend(found.remarks);
+                let remark = |text| Remark { members: members.clone(), is_refusal: false, text };
+                remarks.extend(found.remarks.into_iter().map(remark));
             }
             ComponentAnswer::Refused { reasons, scene_points } => {
                 for (slot, &photo) in members.iter().enumerate() {
                     scene_links[photo] = scene_links[photo].max(scene_points[slot]);
                 }
                 let names: Vec<&str> = members.iter().map(|&photo| photos[photo].name).collect();
-                let refusal = format!("{} is not localized: {}", called(&names), reasons.join("; "));
-                answer.advice.push(refusal);
+                let text = format!("{} is not localized: {}", called(&names), reasons.join("; "));
+                remarks.push(Remark { members, is_refusal: true, text });
             }
         }
     }
@@ -135,21 +183,15 @@ fn locate_by(
     answer.rigid = or_alone(rigid, evidence);
     answer.refined = or_alone(refined, evidence);
     for (photo, path) in answer.refined.iter_mut().zip(&answer.paths) {
-        if photo.verdict == Verdict::NotLocalized {
-            answer.advice.push(path.advice());
-            continue;
-        }
-        if let Some(link) =
-            path.weakest().filter(|link| link.from.is_some() && link.shared < params.verdict.min_link)
+        let weak = |link: &&Link| link.from.is_some() && link.shared < params.verdict.min_link;
+        if let Some(link) = path.weakest().filter(weak)
+            && photo.verdict != Verdict::NotLocalized
         {
             photo.verdict = Verdict::Uncertain;
             photo.reasons.push(format!("its weakest link to the scene shares {} points only", link.shared));
         }
-        if photo.verdict == Verdict::Uncertain {
-            answer.advice.push(path.advice());
-        }
     }
-    answer
+    Answer { set: answer, remarks, elsewhere }
 }
 
 /// What photos that are placed together are called.
@@ -226,10 +268,13 @@ fn rank(verdict: Verdict) -> u8 {
     }
 }
 
-fn keep_better(kept: &mut Option<PhotoLocalization>, other: PhotoLocalization) {
-    if kept.as_ref().is_none_or(|kept| rank(other.verdict) > rank(kept.verdict)) {
+/// Whether the other was better.
+fn keep_better(kept: &mut Option<PhotoLocalization>, other: PhotoLocalization) -> bool {
+    let is_better = kept.as_ref().is_none_or(|kept| rank(other.verdict) > rank(kept.verdict));
+    if is_better {
         *kept = Some(other);
     }
+    is_better
 }
 
 /// Answers of the set, and where it has none, those of the photos alone.
@@ -262,7 +307,7 @@ mod tests {
     use super::*;
     use crate::jackknife::deviation;
     use crate::test_scene::{Place, World, along_street};
-    use crate::{CamsetMethod, SingleParams, locate_single};
+    use crate::{CamsetMethod, PathToScene, SingleParams, locate_single};
 
     fn locate_photos(
         params: &CamsetParams,
@@ -426,18 +471,30 @@ mod tests {
             verdict,
             reasons: Vec::new(),
         };
-        let answer = |photos: Vec<PhotoLocalization>| SetLocalization {
-            rigid: photos.clone(),
-            refined: photos,
-            ..SetLocalization::default()
+        let path = |shared| PathToScene {
+            photo: "photo".to_owned(),
+            links: vec![Link { from: None, to: "photo".to_owned(), shared }],
+        };
+        let answer = |photos: Vec<PhotoLocalization>| Answer {
+            elsewhere: vec![false; photos.len()],
+            remarks: vec![Remark { members: vec![0, 1], is_refusal: true, text: "refused".to_owned() }],
+            set: SetLocalization {
+                rigid: photos.clone(),
+                paths: vec![path(photos[0].inliers), path(photos[1].inliers)],
+                refined: photos,
+                ..SetLocalization::default()
+            },
         };
         let verdicts =
-            |found: &SetLocalization| found.refined.iter().map(|photo| photo.verdict).collect::<Vec<_>>();
+            |found: &Answer| found.set.refined.iter().map(|photo| photo.verdict).collect::<Vec<_>>();
         let first = || answer(vec![photo(Verdict::Localized, 0.0), photo(Verdict::Uncertain, 1.0)]);
         let agreeing = answer(vec![photo(Verdict::Uncertain, 0.01), photo(Verdict::Localized, 1.01)]);
         let best = better_of(first(), agreeing);
         assert_eq!(verdicts(&best), [Verdict::Localized; 2]);
-        assert_eq!(best.refined[0].world_from_camera, first().refined[0].world_from_camera);
+        assert_eq!(best.set.refined[0].world_from_camera, first().set.refined[0].world_from_camera);
+        // Neither that the models were refused nor what to do about a photo holds any more.
+        assert_eq!(best.finished().advice, Vec::<String>::new());
+        assert_eq!(first().finished().advice.len(), 2);
         let elsewhere = answer(vec![photo(Verdict::Localized, 5.0), photo(Verdict::Localized, 6.0)]);
         assert_eq!(better_of(first(), elsewhere), first());
         let poorer = answer(vec![photo(Verdict::Uncertain, 0.0), photo(Verdict::NotLocalized, 1.0)]);

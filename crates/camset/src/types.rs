@@ -114,6 +114,8 @@ pub struct SetLocalization {
     pub refined: Vec<PhotoLocalization>,
     /// Scene from local model, one per used component.
     pub world_from_set: Vec<Similarity>,
+    /// Names of photos that are localized alone, but at another place than with the set: either is wrong.
+    pub contradicted: Vec<String>,
     /// The strongest way from the scene to each photo, one entry a photo.
     pub paths: Vec<PathToScene>,
     /// What happened to each local model, the weakest links and which photo to take next, in sentences.

@@ -109,4 +109,4 @@ serde_artifact!(VerifiedPair, "verified pair", 1);
 serde_artifact!(MapperOutput, "model", 5);
 serde_artifact!(SceneIndex, "index", 1);
 serde_artifact!(SingleLocalization, "photo localization", 2);
-serde_artifact!(SetLocalization, "set localization", 1);
+serde_artifact!(SetLocalization, "set localization", 2);

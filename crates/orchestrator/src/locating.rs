@@ -41,10 +41,15 @@ pub struct Located {
 
 impl Located {
     /// The best answer for each photo with the method that gave it: camset+opt, else camset, else alone.
+    ///
+    /// A photo whose own answer the set contradicts has the set's, which says so.
     pub fn answers(&self) -> Vec<(&'static str, &PhotoLocalization)> {
         let refined = self.set.iter().flat_map(|set| set.refined.iter().map(|p| ("camset+opt", p)));
         let rigid = self.set.iter().flat_map(|set| set.rigid.iter().map(|p| ("camset", p)));
-        let single = self.single.iter().map(|p| ("single", p));
+        let contradicted = |photo: &&PhotoLocalization| {
+            self.set.as_ref().is_some_and(|set| set.contradicted.contains(&photo.name))
+        };
+        let single = self.single.iter().filter(|photo| !contradicted(photo)).map(|p| ("single", p));
         let mut best: BTreeMap<&str, (&'static str, &PhotoLocalization)> = BTreeMap::new();
         for (method, photo) in single.chain(rigid).chain(refined) {
             let better = |old: &PhotoLocalization| rank(photo.verdict) >= rank(old.verdict);
@@ -129,4 +134,38 @@ fn run(
         }
         Ok(result.clone())
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use setloc_features::Camera;
+
+    use super::*;
+
+    #[test]
+    fn a_photo_that_its_set_places_elsewhere_is_no_longer_localized() {
+        let photo = |name: &str, verdict| PhotoLocalization {
+            name: name.to_owned(),
+            camera: Camera::equirectangular(20, 10),
+            world_from_camera: None,
+            covariance: None,
+            inliers: 0,
+            verdict,
+            reasons: Vec::new(),
+        };
+        let set = |contradicted: &[&str]| SetLocalization {
+            refined: vec![photo("a", Verdict::Uncertain), photo("b", Verdict::Uncertain)],
+            contradicted: contradicted.iter().map(|name| (*name).to_owned()).collect(),
+            ..SetLocalization::default()
+        };
+        let located = |contradicted: &[&str]| Located {
+            single: vec![photo("a", Verdict::Localized), photo("b", Verdict::Localized)],
+            set: Some(set(contradicted)),
+            ..Located::default()
+        };
+        let verdicts =
+            |located: &Located| located.answers().iter().map(|(_, photo)| photo.verdict).collect::<Vec<_>>();
+        assert_eq!(verdicts(&located(&[])), [Verdict::Localized, Verdict::Localized]);
+        assert_eq!(verdicts(&located(&["b"])), [Verdict::Localized, Verdict::Uncertain]);
+    }
 }

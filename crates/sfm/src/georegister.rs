@@ -225,8 +225,8 @@ mod tests {
     use crate::{CameraId, ReconstructionImage, Rigid};
 
     /// A measurement with a height.
-    fn at(enu: Vector3<f64>) -> Option<MeasuredPosition> {
-        Some(MeasuredPosition { enu, has_height: true })
+    fn at(enu: Vector3<f64>) -> MeasuredPosition {
+        MeasuredPosition { enu, has_height: true }
     }
 
     fn street(n: usize) -> (Reconstruction, Vec<Option<MeasuredPosition>>, Similarity) {
@@ -248,7 +248,7 @@ mod tests {
                 world_from_camera,
             });
             let noise = Vector3::from_fn(|_, _| rng.random_range(-1.0..1.0));
-            measured.push(at(truth.transform_point(&center) + noise));
+            measured.push(Some(at(truth.transform_point(&center) + noise)));
         }
         (reconstruction, measured, truth)
     }
@@ -256,8 +256,8 @@ mod tests {
     #[test]
     fn survives_wrong_measurements_and_names_them() {
         let (reconstruction, mut measured, truth) = street(20);
-        measured[3] = at(Vector3::new(500.0, 0.0, 0.0));
-        measured[11] = at(Vector3::new(0.0, -300.0, 40.0));
+        measured[3] = Some(at(Vector3::new(500.0, 0.0, 0.0)));
+        measured[11] = Some(at(Vector3::new(0.0, -300.0, 40.0)));
         let found = georegister(&GeoregisterParams::default(), &reconstruction, &measured, &[], 1).unwrap();
         for (image, distance, agrees) in &found.residuals {
             assert_eq!(*agrees, ![3, 11].contains(&image.0), "{image:?} {distance}");
@@ -276,7 +276,7 @@ mod tests {
                 truth.rotation.inverse_transform_vector(&Vector3::new(index as f64, 0.3 * index as f64, 0.0));
             let upright = UnitQuaternion::rotation_between(&-Vector3::y(), &up_in_world).unwrap();
             image.world_from_camera = Some(Rigid::new(upright, center));
-            measured.push(at(truth.transform_point(&center)));
+            measured.push(Some(at(truth.transform_point(&center))));
         }
         (reconstruction, measured, truth)
     }
@@ -298,7 +298,7 @@ mod tests {
         for position in measured.iter_mut().flatten() {
             position.enu += Vector3::from_fn(|_, _| rng.random_range(-2.0..2.0));
         }
-        measured[4] = at(Vector3::new(300.0, -250.0, 30.0));
+        measured[4] = Some(at(Vector3::new(300.0, -250.0, 30.0)));
         let found = georegister(&GeoregisterParams::default(), &reconstruction, &measured, &[true; 12], 1);
         let found = found.unwrap();
         let tilt =

@@ -1,10 +1,12 @@
 //! The quality gate: what in a finished model disagrees with its own evidence.
 
+use nalgebra::Vector3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    ImageId, PairGeometry, Reconstruction, ReconstructionPoint, TwoViewKind, visibility::is_same_view,
+    ImageId, PairGeometry, Reconstruction, ReconstructionPoint, TwoViewKind,
+    visibility::{is_in_image, is_same_view},
 };
 
 /// When to speak up.
@@ -107,6 +109,11 @@ pub fn assess(
     };
     let center =
         |image: ImageId| reconstruction.images[image.index()].world_from_camera.map(|pose| pose.translation);
+    let in_image = |image: ImageId, position: &Vector3<f64>| {
+        reconstruction.images[image.index()].world_from_camera.is_some_and(|pose| {
+            is_in_image(reconstruction.camera_of(image), &pose.inverse_transform_point(position))
+        })
+    };
     let count = |points: &[ReconstructionPoint]| {
         let mut counts = Counts { shared: vec![0; n * n], expected: vec![0; n * n], points_of: vec![0; n] };
         let mut sees = vec![false; n];
@@ -120,11 +127,12 @@ pub fn assess(
                 for other in reconstruction.registered().filter(|&other| other != seen.image) {
                     let Some(candidate) = center(other) else { continue };
                     let cell = seen.image.index() * n + other.index();
-                    let in_view = reconstruction.camera_of(other).is_panoramic();
                     if sees[other.index()] {
                         counts.shared[cell] += 1;
                     }
-                    if in_view && is_same_view(&point.position, &observer, &candidate) {
+                    if is_same_view(&point.position, &observer, &candidate)
+                        && in_image(other, &point.position)
+                    {
                         counts.expected[cell] += 1;
                     }
                 }
@@ -188,6 +196,13 @@ pub fn assess(
     report
 }
 
+/// Matches from which on a single pair that contradicts the model is worth a word: chance does not make so many.
+const LOUD_MATCHES: usize = 100;
+/// Share of the pairs from which on they are, however few matches each has.
+const LOUD_SHARE: f64 = 0.2;
+/// Most pairs that are named.
+const MOST_NAMED: usize = 5;
+
 impl QualityReport {
     /// The report in sentences, worst first; empty when nothing disagrees.
     pub fn sentences(&self, reconstruction: &Reconstruction) -> Vec<String> {
@@ -205,30 +220,96 @@ impl QualityReport {
         for (image, points) in &self.weak_images {
             lines.push(format!("{} is held by {points} points only", name(*image)));
         }
-        if !self.disagreements.is_empty() {
-            let worst: Vec<String> = self
-                .disagreements
+        let is_loud = |pair: &&PairDisagreement| pair.used * 5 < pair.matches && pair.matches >= LOUD_MATCHES;
+        let many = self.disagreements.len() as f64 >= LOUD_SHARE * self.pairs as f64;
+        if !self.disagreements.is_empty() && (many || self.disagreements.iter().any(|pair| is_loud(&pair))) {
+            let mut worst: Vec<&PairDisagreement> = self.disagreements.iter().collect();
+            worst.sort_by_key(|pair| std::cmp::Reverse(pair.matches));
+            let named: Vec<String> = worst
                 .iter()
-                .filter(|pair| pair.used * 5 < pair.matches && pair.matches >= 100)
+                .take(MOST_NAMED)
                 .map(|pair| {
+                    let (first, second) = (name(pair.first), name(pair.second));
                     format!(
-                        "{}–{} ({} of {} matches used)",
-                        name(pair.first),
-                        name(pair.second),
-                        pair.used,
-                        pair.matches
+                        "{first}–{second} ({} of {} matches used, turned by {:.0}°)",
+                        pair.used, pair.matches, pair.rotation_deg
                     )
                 })
                 .collect();
-            if !worst.is_empty() {
-                lines.push(format!(
-                    "{} of {} verified pairs contradict the model, as repeated structure does: {}",
-                    self.disagreements.len(),
-                    self.pairs,
-                    worst.join(", ")
-                ));
-            }
+            lines.push(format!(
+                "{} of {} verified pairs contradict the model, as repeated structure does: {}{}",
+                self.disagreements.len(),
+                self.pairs,
+                named.join(", "),
+                if worst.len() > MOST_NAMED { " and others" } else { "" }
+            ));
         }
         lines
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{CameraId, Observation, ReconstructionImage, Rigid};
+    use nalgebra::UnitQuaternion;
+    use setloc_features::{Camera, CameraModel};
+
+    fn image(name: &str, x: f64) -> ReconstructionImage {
+        ReconstructionImage {
+            name: name.to_owned(),
+            camera: CameraId(0),
+            world_from_camera: Some(Rigid::new(UnitQuaternion::identity(), Vector3::new(x, 0.0, 0.0))),
+        }
+    }
+
+    #[test]
+    fn photos_that_stand_together_and_share_nothing_are_named() {
+        let camera = Camera {
+            model: CameraModel::Pinhole,
+            width: 800,
+            height: 600,
+            params: vec![700.0, 700.0, 400.0, 300.0],
+        };
+        let mut model = Reconstruction {
+            cameras: vec![camera],
+            images: vec![image("a", 0.0), image("b", 0.1)],
+            ..Reconstruction::default()
+        };
+        // Each sees 200 points of its own, ahead of both.
+        for at in 0..400_u32 {
+            let (x, y) = (f64::from(at % 20) * 0.2 - 2.0, f64::from(at / 20) * 0.15 - 1.5);
+            model.points.push(ReconstructionPoint {
+                position: Vector3::new(x, y, 8.0),
+                track: vec![Observation { image: ImageId(at % 2), feature: at }],
+                color: [0; 3],
+                error_sigma: 0.0,
+                aligned: None,
+                covariance: None,
+            });
+        }
+        let report = assess(&QualityParams::default(), &model, &[]);
+        assert_eq!(report.suspicious.len(), 1, "{report:?}");
+        assert!(report.sentences(&model)[0].starts_with("a and b stand together"));
+        // Turned away, neither ought to see what the other does.
+        let turned = UnitQuaternion::from_euler_angles(0.0, std::f64::consts::PI, 0.0);
+        model.images[1].world_from_camera = Some(Rigid::new(turned, Vector3::new(0.1, 0.0, 0.0)));
+        assert_eq!(assess(&QualityParams::default(), &model, &[]).suspicious, []);
+    }
+
+    #[test]
+    fn contradictions_are_said_where_one_is_large_or_they_are_many() {
+        let model =
+            Reconstruction { images: vec![image("a", 0.0), image("b", 1.0)], ..Reconstruction::default() };
+        let said = |pairs: usize, matches: usize, used: usize, rotation_deg: f64| {
+            let pair =
+                PairDisagreement { first: ImageId(0), second: ImageId(1), matches, used, rotation_deg };
+            QualityReport { pairs, disagreements: vec![pair], ..QualityReport::default() }.sentences(&model)
+        };
+        assert_eq!(said(50, 60, 2, 1.0), Vec::<String>::new());
+        assert!(said(50, 300, 20, 1.0)[0].contains("a–b (20 of 300 matches used, turned by 1°)"));
+        assert!(said(4, 60, 2, 1.0)[0].starts_with("1 of 4 verified pairs contradict"));
+        // All used, but at another rotation.
+        assert_eq!(said(4, 60, 60, 25.0).len(), 1);
     }
 }

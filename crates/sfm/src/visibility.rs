@@ -1,4 +1,5 @@
 use nalgebra::Vector3;
+use setloc_features::Camera;
 
 /// Largest angle at the point between two views of it that a descriptor surely survives.
 pub(crate) const SAME_VIEW_ANGLE_RAD: f64 = 0.35;
@@ -15,4 +16,9 @@ pub(crate) fn is_same_view(point: &Vector3<f64>, observer: &Vector3<f64>, candid
     ratio < SAME_VIEW_DISTANCE_RATIO
         && ratio > 1.0 / SAME_VIEW_DISTANCE_RATIO
         && to_candidate.dot(&to_observer) > SAME_VIEW_ANGLE_RAD.cos() * near * far
+}
+
+/// Whether a direction of the camera's frame falls into its image.
+pub(crate) fn is_in_image(camera: &Camera, direction: &Vector3<f64>) -> bool {
+    camera.is_panoramic() || camera.project(direction).is_some_and(|pixel| camera.contains(&pixel))
 }

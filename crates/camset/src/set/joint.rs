@@ -48,6 +48,8 @@ pub(crate) struct ComponentPoses {
     pub world_from_set: Similarity,
     pub rigid: Vec<PhotoLocalization>,
     pub refined: Vec<PhotoLocalization>,
+    /// Whether it stands elsewhere than where it is localized alone.
+    pub elsewhere: Vec<bool>,
     /// Scene points that each photo sees itself.
     pub scene_points: Vec<usize>,
     pub remarks: Vec<String>,
@@ -285,6 +287,13 @@ impl Component<'_> {
                 .iter()
                 .zip(&joint.viewed)
                 .map(|(direct, viewed)| direct.len() + viewed)
+                .collect(),
+            elsewhere: (0..self.members.len())
+                .map(|slot| {
+                    let has_pose = refined[slot].world_from_camera.is_some();
+                    let depth = self.depth(&joint, slot);
+                    has_pose && self.seen_alone(&joint.model.photos, slot, depth) == Some(false)
+                })
                 .collect(),
             refined,
             remarks,

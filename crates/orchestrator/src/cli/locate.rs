@@ -48,6 +48,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Located, Answer)> {
     let located = locate(&session, &photos, &what, args.mode, &name, &target)?;
     write_results(&args.output, &located, &what.scene, &target, &session)?;
     warn_skipped(&located.skipped);
+    warn_of_scene(&what.scene.warnings);
     for advice in located.set.iter().flat_map(|set| &set.advice) {
         print::note(&format!("advice: {advice}"));
     }
@@ -58,6 +59,17 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Located, Answer)> {
     let found = verdict == Verdict::Localized;
     print::note(&format!("target {target}: {}", verdict.in_words()));
     Ok((located, if found { Answer::Done } else { Answer::Negative }))
+}
+
+/// What the build of the scene warned of: a photo's pose is as right as the scene is.
+fn warn_of_scene(warnings: &[String]) {
+    const SHOWN: usize = 3;
+    for warning in warnings.iter().take(SHOWN) {
+        print::note(&format!("warning: of the scene: {warning}"));
+    }
+    if warnings.len() > SHOWN {
+        print::note(&format!("warning: of the scene: {} more in poses.json", warnings.len() - SHOWN));
+    }
 }
 
 /// The photo of that name, or the last by name.
@@ -115,6 +127,7 @@ fn write_results(
                 "camset": of_set(set.map(|set| &set.rigid)), "camset+opt": of_set(set.map(|set| &set.refined)),
             },
             "local_models": located.local_models, "advice": set.map(|set| &set.advice), "skipped": located.skipped,
+            "scene_warnings": scene.warnings,
         }),
     )?;
     let empty = Reconstruction::default();

@@ -49,6 +49,8 @@ struct LocatedPoses {
     photos: Vec<Photo>,
     advice: Option<Vec<String>>,
     skipped: Vec<SkippedImage>,
+    #[serde(default)]
+    scene_warnings: Vec<String>,
 }
 
 #[derive(Deserialize)]
@@ -210,6 +212,7 @@ fn of_photos(name: &str, located: LocatedPoses) -> Digest {
             located.target,
             images.len()
         ),
+        warnings: located.scene_warnings.iter().map(|warning| format!("of the scene: {warning}")).collect(),
         advice: located.advice.unwrap_or_default(),
         images,
         skipped: located.skipped,

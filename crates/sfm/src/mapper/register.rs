@@ -1,12 +1,12 @@
 use nalgebra::Vector3;
 use setloc_features::{GuidedParams, match_guided};
 
-use super::{correspondence::CorrespondenceGraph, direction, model::Model, standpoint::in_view};
+use super::{correspondence::CorrespondenceGraph, direction, model::Model};
 use crate::{
     ImageId, Observation, PointId, Rigid, TwoViewKind,
     robust::{RansacParams, estimate_absolute_pose, refine_absolute_pose},
     solvers::{essential::essential_from_pose, triangulation::length_along},
-    visibility::is_same_view,
+    visibility::{is_in_image, is_same_view},
 };
 
 /// A pose for an unregistered image, with the evidence for and against it.
@@ -347,7 +347,7 @@ pub(super) fn is_in_view(
     let source = &model.input.images[image.index()];
     match source.mosaic {
         Some(mosaic) => mosaic.covers(&direction),
-        None => in_view(&model.cameras[source.camera.index()], &direction),
+        None => is_in_image(&model.cameras[source.camera.index()], &direction),
     }
 }
 

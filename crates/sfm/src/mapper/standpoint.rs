@@ -15,7 +15,7 @@ use setloc_features::{Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match, Ra
 use super::{InputImage, MapperInput, MapperOutput, MapperParams};
 use crate::{
     BaselineLength, CameraId, ImageId, Observation, PairGeometry, Reconstruction, ReconstructionImage, Rigid,
-    TwoViewKind, verify_pair,
+    TwoViewKind, verify_pair, visibility::is_in_image,
 };
 
 /// One photo of a mosaic.
@@ -38,13 +38,8 @@ pub struct Mosaic {
 impl Mosaic {
     /// Whether a direction of the mosaic's frame falls into one of its photos.
     pub fn covers(&self, direction: &Vector3<f64>) -> bool {
-        self.members.iter().any(|member| in_view(&member.camera, &(member.image_from_mosaic * direction)))
+        self.members.iter().any(|member| is_in_image(&member.camera, &(member.image_from_mosaic * direction)))
     }
-}
-
-/// Whether a direction of the camera's frame falls into its image.
-pub(super) fn in_view(camera: &Camera, direction: &Vector3<f64>) -> bool {
-    camera.is_panoramic() || camera.project(direction).is_some_and(|pixel| camera.contains(&pixel))
 }
 
 /// The input with mosaics in place of photos from one standpoint.
@@ -410,6 +405,7 @@ fn sees_the_overlap(
     let second = &input.cameras[input.images[pair.second.index()].camera.index()];
     let bearings = &rays[pair.first.index()].bearings;
     let turn = pair.two_view.second_from_first.rotation;
-    let shared = (0..first.features.own_len()).filter(|&at| in_view(second, &(turn * bearings[at]))).count();
+    let shared =
+        (0..first.features.own_len()).filter(|&at| is_in_image(second, &(turn * bearings[at]))).count();
     pair.two_view.inliers.len() as f64 >= params.min_turn_recall * shared as f64
 }
