@@ -48,7 +48,7 @@ impl CameraBook {
     }
 
     /// The camera of an image, if the file names it.
-    pub fn find(&self, name: &str) -> Option<&Camera> {
-        find_by_name(&self.by_image, name)
+    pub fn find(&self, name: &str, path: &Path) -> Option<&Camera> {
+        find_by_name(&self.by_image, name, path)
     }
 }

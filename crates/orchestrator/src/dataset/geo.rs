@@ -53,7 +53,7 @@ impl GeoBook {
     }
 
     /// The position of an image, if the table names it.
-    pub fn find(&self, name: &str) -> Option<Wgs84> {
-        find_by_name(&self.by_image, name).copied()
+    pub fn find(&self, name: &str, path: &Path) -> Option<Wgs84> {
+        find_by_name(&self.by_image, name, path).copied()
     }
 }
