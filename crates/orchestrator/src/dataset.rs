@@ -3,11 +3,12 @@
 mod cameras;
 mod geo;
 mod images;
+mod remarks;
 mod truth;
 
 pub use cameras::CameraBook;
 pub use geo::{GeoBook, GeoSource};
-pub use images::{ImageFolder, SkippedImage, SourceImage, list_images};
+pub use images::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images};
 pub use truth::{Truth, TruthPose};
 
 use std::collections::BTreeMap;

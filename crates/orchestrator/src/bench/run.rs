@@ -109,7 +109,7 @@ pub struct DatasetFigures {
     pub gps: String,
     /// Unusable images.
     pub skipped: Vec<SkippedImage>,
-    /// What the mapper found worth saying.
+    /// What is worth saying of the images and of the scene.
     pub warnings: Vec<String>,
     /// The scene's largest component.
     #[serde(skip)]
@@ -163,6 +163,8 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     let scene = scene_figures(files.len(), &built, &model, &estimated, &true_scene, &scene_errors);
     let mut sets = Vec::new();
     let mut skipped = built.skipped.clone();
+    let mut warnings = folder.warnings.clone();
+    warnings.extend(built.scene.warnings.clone());
     for set in set_folders(root)? {
         let name = set.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let files = list_below(root, &set)?;
@@ -175,6 +177,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         };
         let located = locate(session, &photos, &what, Mode::Both, &run_name(&set), &target)?;
         skipped.extend(located.skipped.clone());
+        warnings.extend(photos.warnings);
         let true_photos = truth_of(truth.as_ref(), &format!("queries/{name}/"));
         sets.push(set_figures(name, files.len(), target, located, alignment.as_ref(), &true_photos));
     }
@@ -189,7 +192,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         cpu_s,
         gps: format!("{:?}", options.gps).to_lowercase(),
         skipped,
-        warnings: built.scene.warnings.clone(),
+        warnings,
         model,
         scene_errors,
     })

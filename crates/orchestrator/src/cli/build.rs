@@ -51,7 +51,7 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
             (run, skipped)
         }
         BuildOutcome::Built(built) => {
-            write_report(&export, built, &session)?;
+            write_report(&export, built, &folder, &session)?;
             summarize(&built.scene, folder.images.len() + folder.skipped.len());
             (&built.run, &built.skipped)
         }
@@ -113,7 +113,19 @@ fn read_sources(source: &SourceArgs) -> Result<ImageFolder> {
         ));
     }
     let files = list_images(&source.panoramas)?;
-    ImageFolder::read(&files, &source.camera_book()?, &source.geo(), source.masks.as_deref())
+    let folder = ImageFolder::read(&files, &source.camera_book()?, &source.geo(), source.masks.as_deref())?;
+    remark(&folder);
+    Ok(folder)
+}
+
+/// Says what the cameras rest on, and what is odd about the images.
+pub fn remark(folder: &ImageFolder) {
+    if let Some(summary) = folder.camera_summary() {
+        print::note(&summary);
+    }
+    for warning in &folder.warnings {
+        print::note(&format!("warning: {warning}"));
+    }
 }
 
 /// The scene file's name without its ending, or with `-export` when it has none.
@@ -153,11 +165,11 @@ fn write_models(folder: &Path, built: &Built) -> Result<()> {
 }
 
 /// What the build cost and what is wrong with the scene; written last.
-fn write_report(folder: &Path, built: &Built, session: &Session) -> Result<()> {
+fn write_report(folder: &Path, built: &Built, images: &ImageFolder, session: &Session) -> Result<()> {
     let mut report = session.report.to_json();
     report["scene"] = serde_json::json!(built.hash);
     report["skipped"] = serde_json::json!(built.skipped);
-    report["warnings"] = serde_json::json!(built.scene.warnings);
+    report["warnings"] = serde_json::json!([&images.warnings[..], &built.scene.warnings].concat());
     report["notes"] = serde_json::json!(built.scene.notes);
     write_json(&folder.join("report.json"), &report)
 }

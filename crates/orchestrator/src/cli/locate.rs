@@ -8,7 +8,7 @@ use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage};
 
 use super::Answer;
 use super::args::LocateArgs;
-use super::build::{scene_markers, warn_skipped, write_json};
+use super::build::{remark, scene_markers, warn_skipped, write_json};
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use crate::error::Hinted;
 use crate::export::{Marker, localizations_json, ply, top_view_png, write_colmap};
@@ -41,6 +41,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Located, Answer)> {
     let target = find_target(args.target.as_deref(), &files)?;
     let cameras = args.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default();
     let photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
+    remark(&photos);
     // Results of photos are kept beside the scene, where those of its images are.
     let session = args.run.session(&args.scene, Some(&args.output))?;
     let what = LocateJobs { scene: Arc::new(scene), config, seed: args.run.seed };

@@ -105,6 +105,11 @@ impl GeoBook {
     pub fn find(&self, name: &str, path: &Path) -> Option<Wgs84> {
         find_by_name(&self.by_image, name, path).copied()
     }
+
+    /// The first image that the table names.
+    pub(super) fn first_name(&self) -> Option<&str> {
+        self.by_image.keys().next().map(String::as_str)
+    }
 }
 
 #[cfg(test)]

@@ -3,8 +3,9 @@ use std::path::{Component, Path, PathBuf};
 
 use anyhow::{Context, Result};
 use rayon::prelude::*;
-use setloc_features::{Camera, Wgs84};
+use setloc_features::{Camera, CameraSource, Wgs84};
 
+use super::remarks::{Given, warnings_of};
 use super::{CameraBook, GeoBook, GeoSource};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
@@ -26,12 +27,21 @@ pub struct SourceImage {
     pub camera: Camera,
     /// Whether the intrinsics are known and stay.
     pub camera_fixed: bool,
-    /// Where the camera comes from, for people.
-    pub camera_source: String,
+    /// Where the camera comes from.
+    pub camera_origin: CameraOrigin,
     /// Measured position.
     pub position: Option<Wgs84>,
     /// Mask image.
     pub mask: Option<(PathBuf, ContentHash)>,
+}
+
+/// Where an image's camera comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CameraOrigin {
+    /// From `cameras.json`.
+    Listed,
+    /// From the image itself, or from nothing.
+    Guessed(CameraSource),
 }
 
 /// An image that cannot be used, and why.
@@ -50,6 +60,8 @@ pub struct ImageFolder {
     pub images: Vec<SourceImage>,
     /// Images that cannot be used.
     pub skipped: Vec<SkippedImage>,
+    /// What is worth saying of the usable ones and of what was given with them.
+    pub warnings: Vec<String>,
 }
 
 /// Image files of folders (not their subfolders) and single files: unique names and paths, sorted by name.
@@ -157,13 +169,20 @@ impl ImageFolder {
     /// Reads hash, size, camera and position of the named files; what is no image is skipped with its reason.
     ///
     /// # Errors
-    /// When not a single file is readable.
+    /// When not a single file is readable, or there is no folder of masks.
     pub fn read(
         files: &[(String, PathBuf)],
         cameras: &CameraBook,
         geo: &GeoSource,
         masks: Option<&Path>,
     ) -> Result<Self> {
+        if let Some(folder) = masks.filter(|folder| !folder.is_dir()) {
+            let message = format!("{} is no folder", folder.display());
+            return Err(Hinted::error(
+                message,
+                "--masks names a folder of mask images, as `masks/a.jpg.png`",
+            ));
+        }
         let table = match geo {
             GeoSource::Table(path) => GeoBook::read(path)?,
             GeoSource::None | GeoSource::Exif => GeoBook::default(),
@@ -194,6 +213,7 @@ impl ImageFolder {
                 format!("none of {} files is a readable image ({})", files.len(), reasons.join("; "));
             return Err(Hinted::error(message, "check the files with an image viewer"));
         }
+        folder.warnings = warnings_of(&folder.images, &Given { cameras, geo, table: &table, masks });
         Ok(folder)
     }
 }
@@ -204,12 +224,12 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
     let info = stages::probe(&bytes, &stages::DecodeLimits::default()).context("not a readable image")?;
     let known =
         cameras.find(name, path).filter(|camera| (camera.width, camera.height) == (info.width, info.height));
-    let (camera, camera_fixed, camera_source) = if let Some(camera) = known {
-        (camera.clone(), true, "cameras.json".to_owned())
+    let (camera, camera_fixed, camera_origin) = if let Some(camera) = known {
+        (camera.clone(), true, CameraOrigin::Listed)
     } else {
         let (camera, source) = stages::guess_camera(&info);
         let fixed = camera.is_panoramic();
-        (camera, fixed, source.to_string())
+        (camera, fixed, CameraOrigin::Guessed(source))
     };
     let exif = (*geo == GeoSource::Exif).then_some(info.metadata.gps).flatten();
     let position =
@@ -222,7 +242,7 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
         hash,
         camera,
         camera_fixed,
-        camera_source,
+        camera_origin,
         position,
         mask: None,
     })
