@@ -35,7 +35,7 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
                 markers.iter().map(|m| (m.world_from_camera.translation, m.color)).collect();
             ply(model, &centres)
         }
-        ExportFormat::Nerfstudio => serde_json::to_string_pretty(&nerfstudio(model))?,
+        ExportFormat::Nerfstudio => serde_json::to_string_pretty(&nerfstudio(model)?)?,
         ExportFormat::Json => serde_json::to_string_pretty(&scene_json(&scene))?,
         ExportFormat::Geojson => {
             let poses =
