@@ -22,6 +22,9 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
             let folder = args.output.as_deref().ok_or_else(needs_output)?;
             write_colmap(folder, model, &[]).context("cannot write the COLMAP model")?;
             print::note(&format!("wrote {}/", folder.display()));
+            print::note(
+                "note: a scene file has no keypoints: 2D points and tracks are in the model that `setloc build` writes",
+            );
             return Ok(Answer::Done);
         }
         ExportFormat::TopView => {
