@@ -95,6 +95,9 @@ fn scene_table(text: &mut String, figures: &DatasetFigures) {
     for skipped in &figures.skipped {
         add(text, format_args!("\nSkipped {}: {}\n", skipped.name, skipped.reason));
     }
+    for (set, reason) in &figures.skipped_sets {
+        add(text, format_args!("\nSkipped set {set}: {reason}\n"));
+    }
     for warning in &figures.warnings {
         add(text, format_args!("\nWarning: {warning}\n"));
     }
