@@ -1,8 +1,7 @@
-use std::fmt::Write;
-
 use super::{
     AUC_THRESHOLDS_DEG, Bounds, Calibration, DatasetFigures, MethodFigures, NormalizedError, SetFigures,
 };
+use crate::text::add;
 
 /// Methods in the paper's order.
 const METHODS: [&str; 3] = ["single", "camset", "camset+opt"];
@@ -52,11 +51,6 @@ pub fn markdown_tables(figures: &DatasetFigures) -> String {
     add(&mut text, format_args!("| all | | | {:.2} | {:.2} |\n\n", figures.wall_s, figures.cpu_s));
     add(&mut text, format_args!("Peak memory {:.0} MiB.\n", figures.peak_rss_mb));
     text
-}
-
-/// Writing to a string cannot fail.
-fn add(text: &mut String, line: std::fmt::Arguments<'_>) {
-    let _ = text.write_fmt(line);
 }
 
 fn scene_table(text: &mut String, figures: &DatasetFigures) {
