@@ -294,6 +294,30 @@ mod tests {
     }
 
     #[test]
+    fn images_with_longer_names_are_found_by_short_and_long_ones() {
+        let root = tempfile::tempdir().unwrap();
+        let days = ["day1", "day2", "day3"].map(|day| root.path().join(day).join("panoramas"));
+        for (shade, day) in days.iter().enumerate() {
+            std::fs::create_dir_all(day).unwrap();
+            let image = image::GrayImage::from_pixel(40, 30, image::Luma([shade as u8]));
+            image.save(day.join("0.png")).unwrap();
+        }
+        let (table, cameras) = (root.path().join("geo.csv"), root.path().join("cameras.json"));
+        let positions = "day1/panoramas/0.png,1,8\nday2/panoramas/0.png,2,8\npanoramas/0.png,3,8\n";
+        std::fs::write(&table, positions).unwrap();
+        let camera = Camera::from_focal_guess(40, 30, 77.0);
+        let listed = serde_json::json!({ "cameras": { "c": camera }, "images": { "panoramas/0.png": "c" } });
+        std::fs::write(&cameras, listed.to_string()).unwrap();
+        let book = CameraBook::read(&cameras).unwrap();
+        let read =
+            ImageFolder::read(&list_images(&days).unwrap(), &book, &GeoSource::Table(table), None).unwrap();
+        let latitudes: Vec<f64> = read.images.iter().map(|image| image.position.unwrap().lat).collect();
+        assert_eq!(latitudes, [1.0, 2.0, 3.0]);
+        assert!(read.images.iter().all(|image| image.camera == camera && image.camera_fixed));
+        assert!(read.warnings.is_empty(), "{:?}", read.warnings);
+    }
+
+    #[test]
     fn one_file_is_listed_once_however_it_is_written() {
         let given = ["p", "p/0.png", "p/../p", "./p/0.png"];
         assert_eq!(names(&["p/0.png", "p/1.png"], &given), ["p/0.png", "p/1.png"]);
