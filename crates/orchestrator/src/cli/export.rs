@@ -23,7 +23,7 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
             write_colmap(folder, model, &[]).context("cannot write the COLMAP model")?;
             print::note(&format!("wrote {}/", folder.display()));
             print::note(
-                "note: a scene file has no keypoints: 2D points and tracks are in the model that `setloc build` writes",
+                "note: without 2D points and tracks, since a scene file lacks their keypoints; the model that `setloc build` writes has them",
             );
             return Ok(Answer::Done);
         }
