@@ -3,26 +3,30 @@
 mod cameras;
 mod geo;
 mod images;
+mod remarks;
 mod truth;
 
 pub use cameras::CameraBook;
 pub use geo::{GeoBook, GeoSource};
-pub use images::{ImageFolder, SkippedImage, SourceImage, list_images};
+pub use images::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images};
 pub use truth::{Truth, TruthPose};
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
-/// Looks a name up by its path; if it is not there, by as much of the path's end as tells it from all others.
+/// Looks an image up: by the longest end of its path that is listed, by its name, or as the only listed one whose
+/// path ends in its name.
 ///
-/// So `south/img_00.jpg` and a file given by itself find `queries/south/img_00.jpg`.
-fn find_by_name<'m, T>(map: &'m BTreeMap<String, T>, name: &str) -> Option<&'m T> {
-    map.get(name).or_else(|| {
-        let common = |key: &str| {
-            key.rsplit('/').zip(name.rsplit('/')).take_while(|(theirs, ours)| theirs == ours).count()
-        };
-        let most = map.keys().map(|key| common(key)).max().filter(|&most| most > 0)?;
-        let mut best = map.iter().filter(|(key, _)| common(key) == most);
-        match (best.next(), best.next()) {
+/// So `south/img_00.jpg` and a file given by itself find `queries/south/img_00.jpg`, and nothing is found in another
+/// folder.
+fn find_by_name<'m, T>(map: &'m BTreeMap<String, T>, name: &str, path: &Path) -> Option<&'m T> {
+    let whole = images::whole_path(path).to_string_lossy().replace('\\', "/");
+    let ends = std::iter::successors(Some(whole.as_str()), |end| Some(end.split_once('/')?.1));
+    let by_end = ends.filter(|end| !end.is_empty()).find_map(|end| map.get(end));
+    by_end.or_else(|| map.get(name)).or_else(|| {
+        let end = format!("/{name}");
+        let mut longer = map.iter().filter(|(key, _)| key.ends_with(&end));
+        match (longer.next(), longer.next()) {
             (Some((_, value)), None) => Some(value),
             _ => None,
         }
@@ -33,15 +37,29 @@ fn find_by_name<'m, T>(map: &'m BTreeMap<String, T>, name: &str) -> Option<&'m T
 mod tests {
     use super::*;
 
+    fn map(names: &[&str]) -> BTreeMap<String, usize> {
+        names.iter().enumerate().map(|(at, name)| ((*name).to_owned(), at)).collect()
+    }
+
     #[test]
-    fn names_are_found_by_as_much_of_their_end_as_is_unique() {
-        let names = ["queries/north/0.jpg", "queries/south/0.jpg", "queries/south/1.jpg"];
-        let map: BTreeMap<String, usize> =
-            names.iter().enumerate().map(|(at, name)| ((*name).to_owned(), at)).collect();
-        assert_eq!(find_by_name(&map, "queries/north/0.jpg"), Some(&0));
-        assert_eq!(find_by_name(&map, "south/0.jpg"), Some(&1));
-        assert_eq!(find_by_name(&map, "1.jpg"), Some(&2));
-        assert_eq!(find_by_name(&map, "0.jpg"), None);
-        assert_eq!(find_by_name(&map, "west/2.jpg"), None);
+    fn names_are_found_by_whole_folders_and_never_in_another_one() {
+        let map = map(&["queries/north/0.jpg", "queries/south/0.jpg", "queries/south/1.jpg", "2.jpg"]);
+        let find = |name: &str| find_by_name(&map, name, &Path::new("/somewhere").join(name));
+        assert_eq!(find("queries/north/0.jpg"), Some(&0));
+        assert_eq!(find("south/0.jpg"), Some(&1));
+        assert_eq!(find("1.jpg"), Some(&2));
+        assert_eq!(find("west/2.jpg"), Some(&3));
+        assert_eq!(find("0.jpg"), None);
+        assert_eq!(find("west/1.jpg"), None);
+        assert_eq!(find("th/1.jpg"), None);
+    }
+
+    #[test]
+    fn the_longest_end_of_the_path_decides() {
+        let map = map(&["panoramas/0.jpg", "day1/panoramas/0.jpg", "/data/day2/panoramas/0.jpg"]);
+        let find = |day: &str, name: &str| find_by_name(&map, name, Path::new(day).join(name).as_path());
+        assert_eq!(find("/data/day1", "panoramas/0.jpg"), Some(&1));
+        assert_eq!(find("/data/day2", "panoramas/0.jpg"), Some(&2));
+        assert_eq!(find("/data/", "day3/panoramas/0.jpg"), Some(&0));
     }
 }

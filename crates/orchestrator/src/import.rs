@@ -83,7 +83,7 @@ impl ImportedModel {
 }
 
 fn is_content(line: &str) -> bool {
-    !line.trim().is_empty() && !line.starts_with('#')
+    !line.trim().is_empty() && !line.trim_start().starts_with('#')
 }
 
 /// `CAMERA_ID MODEL WIDTH HEIGHT PARAMS…`
@@ -103,8 +103,14 @@ fn parse_camera(line: &str) -> Result<(u32, Camera)> {
 
 /// `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, the pose camera-from-world.
 fn parse_image(line: &str) -> Result<(String, u32, Rigid)> {
-    let fields: Vec<&str> = line.trim().splitn(10, ' ').collect();
-    let [_, numbers @ .., camera, name] = &fields[..] else {
+    // The name may hold blanks.
+    let mut name = line.trim();
+    let mut fields = Vec::new();
+    while let Some((field, rest)) = name.split_once(char::is_whitespace).filter(|_| fields.len() < 9) {
+        fields.push(field);
+        name = rest.trim_start();
+    }
+    let [_, numbers @ .., camera] = &fields[..] else {
         anyhow::bail!("an image has number, rotation, translation, camera and name");
     };
     let numbers = numbers.iter().map(|text| finite(text)).collect::<Result<Vec<f64>>>()?;
@@ -114,7 +120,7 @@ fn parse_image(line: &str) -> Result<(String, u32, Rigid)> {
     let rotation =
         UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6).context("the rotation is zero")?;
     let camera_from_world = Rigid::new(rotation, Vector3::new(tx, ty, tz));
-    Ok(((*name).to_owned(), camera.parse()?, camera_from_world.inverse()))
+    Ok((name.to_owned(), camera.parse()?, camera_from_world.inverse()))
 }
 
 fn finite(text: &str) -> Result<f64> {
@@ -162,6 +168,17 @@ mod tests {
     }
 
     #[test]
+    fn fields_are_parted_by_any_white_space() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+        write("cameras.txt", "  # a comment\n1\tSIMPLE_PINHOLE  640 480\t500 320 240\r\n");
+        write("images.txt", " 1  1 0\t0 0  4 5   6\t1  a  b.jpg \r\n\r\n2 1 0 0 0 0 0 0 1 c.jpg\n");
+        let read = ImportedModel::read_colmap(folder.path()).unwrap();
+        assert_eq!(read.images.keys().collect::<Vec<_>>(), ["a  b.jpg", "c.jpg"]);
+        assert_eq!(read.images["a  b.jpg"].1.translation, Vector3::new(-4.0, -5.0, -6.0));
+    }
+
+    #[test]
     fn wrong_lines_are_named() {
         let error_of = |cameras: &str, images: &str| {
             let folder = tempfile::tempdir().unwrap();
@@ -173,6 +190,7 @@ mod tests {
         assert!(error_of("1 PINHOL 640 480 1 1 1 1\n", "").contains("cameras.txt, line 1"));
         assert!(error_of("1 SIMPLE_PINHOLE 640 480 NaN 320 240\n", "").contains("no finite number"));
         assert!(error_of(good, "1 1 0 0 0 0 0 x 1 a.jpg\n").contains("images.txt, line 1"));
+        assert!(error_of(good, "1 1 0 0 0 0 0 0 1\n").contains("images.txt, line 1"));
         assert!(error_of(good, "1 0 0 0 0 0 0 0 1 a.jpg\n").contains("rotation is zero"));
         assert!(
             error_of(good, "\n1 1 0 0 0 0 0 0 2 a.jpg\n").contains("line 2: cameras.txt has no camera 2")

@@ -30,3 +30,4 @@ pub mod session;
 pub mod stages;
 pub mod store;
 pub mod subscribers;
+pub mod text;

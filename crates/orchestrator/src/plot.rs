@@ -1,6 +1,6 @@
 //! Plots as inline SVG: self-contained, no script, readable in print.
 
-use std::fmt::Write;
+use crate::text::add;
 
 /// Width of every plot in pixels.
 const WIDTH: f64 = 560.0;
@@ -242,11 +242,6 @@ fn svg(title: &str, height: f64, body: &str) -> String {
         "<svg viewBox='0 0 {WIDTH} {height}' width='{WIDTH}' height='{height}' role='img' font-family='sans-serif' font-size='11'><text x='{LEFT}' y='14' font-size='13' font-weight='bold'>{}</text>{body}</svg>\n",
         escape(title)
     )
-}
-
-/// Writing to a string cannot fail.
-fn add(text: &mut String, part: std::fmt::Arguments<'_>) {
-    let _ = text.write_fmt(part);
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{said, setloc};
+use common::{gave, panoramas, said, setloc, town};
 
 fn picture(shade: u8) -> image::RgbImage {
     image::RgbImage::from_fn(256, 128, |x, y| image::Rgb([(x as u8) ^ (y as u8).wrapping_mul(shade); 3]))
@@ -26,24 +26,53 @@ fn an_empty_folder_is_an_error_with_a_hint() {
 #[test]
 fn bad_images_among_good_ones_are_skipped_with_a_reason() {
     let folder = tempfile::tempdir().unwrap();
-    let panoramas = folder.path().join("panoramas");
-    std::fs::create_dir(&panoramas).unwrap();
-    picture(3).save(panoramas.join("a.jpg")).unwrap();
-    picture(5).save(panoramas.join("b.jpg")).unwrap();
-    let whole = std::fs::read(panoramas.join("a.jpg")).unwrap();
+    let panoramas = town(folder.path()).join("panoramas");
+    let good = panoramas.join("pano_000.jpg");
+    let whole = std::fs::read(&good).unwrap();
     std::fs::write(panoramas.join("truncated.jpg"), &whole[..whole.len() / 2]).unwrap();
     std::fs::write(panoramas.join("text.jpg"), "this is no picture").unwrap();
     std::fs::write(panoramas.join("nothing.jpg"), "").unwrap();
+    std::fs::copy(&good, panoramas.join("again.jpg")).unwrap();
     image::RgbImage::new(256, 128).save(panoramas.join("black.jpg")).unwrap();
-    let output = setloc(folder.path(), &["build", "panoramas", "-o", "s.setloc"]);
+    let output = setloc(folder.path(), &["build", "town/panoramas", "-o", "s.setloc"]);
     let text = said(&output);
-    assert!(matches!(output.status.code(), Some(0 | 1)), "{text}");
-    assert!(
-        text.contains("skipped panoramas/text.jpg") && text.contains("skipped panoramas/nothing.jpg"),
-        "{text}"
-    );
-    assert!(!text.contains("skipped panoramas/a.jpg"), "{text}");
-    assert!(folder.path().join("s.setloc").is_file());
+    assert_eq!(output.status.code(), Some(0), "{text}");
+    for line in [
+        "skipped panoramas/truncated.jpg: the JPEG image is truncated",
+        "skipped panoramas/text.jpg: not a readable image",
+        "skipped panoramas/nothing.jpg: the file is empty",
+        "3 images skipped",
+        "warning: images of equal content: panoramas/again.jpg and panoramas/pano_000.jpg",
+    ] {
+        assert!(text.contains(line), "{line}: {text}");
+    }
+    assert_eq!(text.matches("skipped panoramas/").count(), 3, "{text}");
+    // An image without texture is kept, and told not to be registered.
+    let report = gave(&setloc(folder.path(), &["report", "s.setloc"]));
+    assert!(report.contains("panoramas/black.jpg\tnot registered\t0 observations"), "{report}");
+    assert!(report.contains("panoramas/pano_003.jpg\tregistered"), "{report}");
+    assert!(report.contains("not registered: panoramas/black.jpg;"), "{report}");
+    assert!(report.contains("skipped panoramas/truncated.jpg: "), "{report}");
+}
+
+#[test]
+fn options_that_fit_no_image_are_said() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    std::fs::create_dir(folder.path().join("masks")).unwrap();
+    std::fs::write(folder.path().join("geo.csv"), "name,lat,lon\npano/p0.png,47,8\n").unwrap();
+    let plan = |options: &[&str]| setloc(folder.path(), &[&["plan", "panoramas"], options].concat());
+    let output = plan(&["--gps", "geo.csv", "--masks", "masks"]);
+    let text = said(&output);
+    assert_eq!(output.status.code(), Some(0), "{text}");
+    assert!(text.contains("cameras: 2 panoramas by the 2:1 aspect ratio\n"), "{text}");
+    assert!(text.contains("warning: geo.csv has the position of no image: it lists `pano/p0.png`"), "{text}");
+    assert!(text.contains("warning: masks has the mask of no image"), "{text}");
+    let exif = plan(&["--gps", "exif"]);
+    assert!(said(&exif).contains("warning: no image has a position in its EXIF"), "{}", said(&exif));
+    let nowhere = plan(&["--masks", "mask"]);
+    assert_eq!(nowhere.status.code(), Some(2));
+    assert!(said(&nowhere).contains("mask is no folder") && said(&nowhere).contains("hint: "));
 }
 
 #[test]

@@ -86,6 +86,7 @@ fn a_data_set_by_path_keeps_its_results_schema() {
         "scene",
         "sets",
         "skipped",
+        "skipped_sets",
         "stages",
         "wall_s",
         "warnings",
@@ -114,6 +115,31 @@ fn a_data_set_by_path_keeps_its_results_schema() {
     assert_eq!(refined["calibration"]["photos"], refined["registered"]);
     assert!(folder.path().join("out/seed-1/results.json").is_file());
     assert_eq!(json_of(&folder.path().join("out/repeats.json"))["scene/registered"]["repeats"], 2);
+}
+
+#[test]
+fn a_set_without_a_readable_photo_is_skipped_and_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let queries = town(folder.path()).join("queries");
+    let photo = std::fs::read(queries.join("lane/img_00.jpg")).unwrap();
+    for set in ["empty", "text", "truncated"] {
+        std::fs::create_dir(queries.join(set)).unwrap();
+    }
+    std::fs::write(queries.join("text/a.jpg"), "this is no picture").unwrap();
+    std::fs::write(queries.join("truncated/a.jpg"), &photo[..photo.len() / 2]).unwrap();
+    let output = setloc(folder.path(), &["bench", "town", "-o", "out"]);
+    let text = said(&output);
+    assert_eq!(output.status.code(), Some(0), "{text}");
+    let results = json_of(&folder.path().join("out/results.json"));
+    let names: Vec<&Value> = results["sets"].as_array().unwrap().iter().map(|set| &set["name"]).collect();
+    assert_eq!(names, ["lane"]);
+    let reasons = [("empty", "no images in "), ("text", "queries/text/a.jpg"), ("truncated", "truncated")];
+    for (set, reason) in reasons {
+        let told = results["skipped_sets"][set].as_str().unwrap();
+        assert!(told.contains(reason), "{told}");
+        assert!(text.contains(&format!("skipped set {set}: {told}")), "{text}");
+        assert!(gave(&output).contains(&format!("Skipped set {set}: {told}")), "{}", gave(&output));
+    }
 }
 
 #[test]

@@ -1,11 +1,11 @@
 use std::collections::BTreeMap;
-use std::fmt::Write;
 
 use serde_json::{Value, json};
 
 use super::baseline::{Delta, Judgement};
 use super::metrics::{MetricKind, Metrics, Repeated};
 use super::{DatasetFigures, TruthKind};
+use crate::text::add;
 
 /// What a benchmark over several data sets, parameter sets and seeds came to.
 #[derive(Debug, Clone, Default)]
@@ -138,9 +138,4 @@ fn deltas_markdown(deltas: &[Delta]) -> String {
         ),
     );
     text + "Noise is 3 standard deviations of the repeats, and at least half an image, 3 mm or 25 %, 0.02° or 25 %, 1.5 points of AUC.\nTimes are told in `results.json` and never judged.\n"
-}
-
-/// Writing to a string cannot fail.
-fn add(text: &mut String, line: std::fmt::Arguments<'_>) {
-    let _ = text.write_fmt(line);
 }

@@ -109,7 +109,9 @@ pub struct DatasetFigures {
     pub gps: String,
     /// Unusable images.
     pub skipped: Vec<SkippedImage>,
-    /// What the mapper found worth saying.
+    /// Sets without a usable photo, and why.
+    pub skipped_sets: BTreeMap<String, String>,
+    /// What is worth saying of the images and of the scene.
     pub warnings: Vec<String>,
     /// The scene's largest component.
     #[serde(skip)]
@@ -163,10 +165,21 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     let scene = scene_figures(files.len(), &built, &model, &estimated, &true_scene, &scene_errors);
     let mut sets = Vec::new();
     let mut skipped = built.skipped.clone();
+    let mut skipped_sets = BTreeMap::new();
+    let mut warnings = folder.warnings.clone();
+    warnings.extend(built.scene.warnings.clone());
     for set in set_folders(root)? {
         let name = set.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        let files = list_below(root, &set)?;
-        let photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
+        // A set of nothing readable leaves the others as they are.
+        let read = list_below(root, &set)
+            .and_then(|files| Ok((ImageFolder::read(&files, &cameras, &GeoSource::None, None)?, files)));
+        let (photos, files) = match read {
+            Ok(read) => read,
+            Err(error) => {
+                skipped_sets.insert(name, format!("{error:#}"));
+                continue;
+            }
+        };
         let target = files.last().map(|(name, _)| name.clone()).unwrap_or_default();
         let what = LocateJobs {
             scene: Arc::clone(&built.scene),
@@ -174,7 +187,14 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
             seed: options.seed,
         };
         let located = locate(session, &photos, &what, Mode::Both, &run_name(&set), &target)?;
+        if located.skipped.len() == files.len() {
+            let reasons: Vec<String> =
+                located.skipped.iter().map(|photo| format!("{}: {}", photo.name, photo.reason)).collect();
+            skipped_sets.insert(name, format!("no usable photo: {}", reasons.join("; ")));
+            continue;
+        }
         skipped.extend(located.skipped.clone());
+        warnings.extend(photos.warnings);
         let true_photos = truth_of(truth.as_ref(), &format!("queries/{name}/"));
         sets.push(set_figures(name, files.len(), target, located, alignment.as_ref(), &true_photos));
     }
@@ -189,7 +209,8 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         cpu_s,
         gps: format!("{:?}", options.gps).to_lowercase(),
         skipped,
-        warnings: built.scene.warnings.clone(),
+        skipped_sets,
+        warnings,
         model,
         scene_errors,
     })

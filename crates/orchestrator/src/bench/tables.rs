@@ -1,8 +1,7 @@
-use std::fmt::Write;
-
 use super::{
     AUC_THRESHOLDS_DEG, Bounds, Calibration, DatasetFigures, MethodFigures, NormalizedError, SetFigures,
 };
+use crate::text::add;
 
 /// Methods in the paper's order.
 const METHODS: [&str; 3] = ["single", "camset", "camset+opt"];
@@ -54,11 +53,6 @@ pub fn markdown_tables(figures: &DatasetFigures) -> String {
     text
 }
 
-/// Writing to a string cannot fail.
-fn add(text: &mut String, line: std::fmt::Arguments<'_>) {
-    let _ = text.write_fmt(line);
-}
-
 fn scene_table(text: &mut String, figures: &DatasetFigures) {
     let scene = &figures.scene;
     add(
@@ -94,6 +88,9 @@ fn scene_table(text: &mut String, figures: &DatasetFigures) {
     }
     for skipped in &figures.skipped {
         add(text, format_args!("\nSkipped {}: {}\n", skipped.name, skipped.reason));
+    }
+    for (set, reason) in &figures.skipped_sets {
+        add(text, format_args!("\nSkipped set {set}: {reason}\n"));
     }
     for warning in &figures.warnings {
         add(text, format_args!("\nWarning: {warning}\n"));

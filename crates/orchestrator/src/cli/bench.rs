@@ -141,6 +141,9 @@ fn repeat(
             if seed == args.run.seed { output.to_owned() } else { output.join(format!("seed-{seed}")) };
         let session = run.session(&output, Some(&output))?;
         let figures = bench_dataset(&session, root, &BenchOptions { config: run.config()?, seed, gps })?;
+        for (set, reason) in &figures.skipped_sets {
+            print::note(&format!("skipped set {set}: {reason}"));
+        }
         write_figures(&output, &figures)?;
         Ok(figures)
     };

@@ -11,7 +11,7 @@ use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
 use crate::building::{BuildOutcome, Built, build_scene};
 use crate::dataset::{ImageFolder, SkippedImage, list_images};
 use crate::error::Hinted;
-use crate::export::{Marker, ply, scene_json, top_view_png, write_colmap};
+use crate::export::{Marker, colmap_lacks, ply, scene_json, top_view_png, write_colmap};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, Prediction};
 use crate::jobs::add_scene;
@@ -51,8 +51,11 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
             (run, skipped)
         }
         BuildOutcome::Built(built) => {
-            write_report(&export, built, &session)?;
+            write_report(&export, built, &folder, &session)?;
             summarize(&built.scene, folder.images.len() + folder.skipped.len());
+            if let Some(lack) = built.scene.main().and_then(colmap_lacks) {
+                print::note(&format!("warning: no COLMAP model is written: {lack}"));
+            }
             (&built.run, &built.skipped)
         }
     };
@@ -113,7 +116,19 @@ fn read_sources(source: &SourceArgs) -> Result<ImageFolder> {
         ));
     }
     let files = list_images(&source.panoramas)?;
-    ImageFolder::read(&files, &source.camera_book()?, &source.geo(), source.masks.as_deref())
+    let folder = ImageFolder::read(&files, &source.camera_book()?, &source.geo(), source.masks.as_deref())?;
+    remark(&folder);
+    Ok(folder)
+}
+
+/// Says what the cameras rest on, and what is odd about the images.
+pub fn remark(folder: &ImageFolder) {
+    if let Some(summary) = folder.camera_summary() {
+        print::note(&summary);
+    }
+    for warning in &folder.warnings {
+        print::note(&format!("warning: {warning}"));
+    }
 }
 
 /// The scene file's name without its ending, or with `-export` when it has none.
@@ -144,7 +159,11 @@ fn write_models(folder: &Path, built: &Built) -> Result<()> {
         .map(|image| built.features.get(&image.name).map(|features| &**features))
         .collect();
     let writers: [&(dyn Fn() -> Result<()> + Sync); 4] = [
-        &|| write_colmap(&folder.join("colmap"), model, &features),
+        &|| match colmap_lacks(model) {
+            // Said when the scene is.
+            Some(_) => Ok(()),
+            None => write_colmap(&folder.join("colmap"), model, &features),
+        },
         &|| write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes()),
         &|| write_json(&folder.join("poses.json"), &scene_json(&built.scene)),
         &|| write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?),
@@ -153,11 +172,11 @@ fn write_models(folder: &Path, built: &Built) -> Result<()> {
 }
 
 /// What the build cost and what is wrong with the scene; written last.
-fn write_report(folder: &Path, built: &Built, session: &Session) -> Result<()> {
+fn write_report(folder: &Path, built: &Built, images: &ImageFolder, session: &Session) -> Result<()> {
     let mut report = session.report.to_json();
     report["scene"] = serde_json::json!(built.hash);
     report["skipped"] = serde_json::json!(built.skipped);
-    report["warnings"] = serde_json::json!(built.scene.warnings);
+    report["warnings"] = serde_json::json!([&images.warnings[..], &built.scene.warnings].concat());
     report["notes"] = serde_json::json!(built.scene.notes);
     write_json(&folder.join("report.json"), &report)
 }

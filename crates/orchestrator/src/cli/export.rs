@@ -22,6 +22,9 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
             let folder = args.output.as_deref().ok_or_else(needs_output)?;
             write_colmap(folder, model, &[]).context("cannot write the COLMAP model")?;
             print::note(&format!("wrote {}/", folder.display()));
+            print::note(
+                "note: without 2D points and tracks, since a scene file lacks their keypoints; the model that `setloc build` writes has them",
+            );
             return Ok(Answer::Done);
         }
         ExportFormat::TopView => {
@@ -35,7 +38,7 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
                 markers.iter().map(|m| (m.world_from_camera.translation, m.color)).collect();
             ply(model, &centres)
         }
-        ExportFormat::Nerfstudio => serde_json::to_string_pretty(&nerfstudio(model))?,
+        ExportFormat::Nerfstudio => serde_json::to_string_pretty(&nerfstudio(model)?)?,
         ExportFormat::Json => serde_json::to_string_pretty(&scene_json(&scene))?,
         ExportFormat::Geojson => {
             let poses =

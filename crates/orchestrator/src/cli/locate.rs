@@ -1,4 +1,4 @@
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Result;
@@ -8,10 +8,10 @@ use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage};
 
 use super::Answer;
 use super::args::LocateArgs;
-use super::build::{scene_markers, warn_skipped, write_json};
+use super::build::{remark, scene_markers, warn_skipped, write_json};
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use crate::error::Hinted;
-use crate::export::{Marker, localizations_json, ply, top_view_png, write_colmap};
+use crate::export::{Marker, colmap_lacks, localizations_json, ply, top_view_png, write_colmap};
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, locate};
 use crate::print;
@@ -41,6 +41,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Located, Answer)> {
     let target = find_target(args.target.as_deref(), &files)?;
     let cameras = args.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default();
     let photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
+    remark(&photos);
     // Results of photos are kept beside the scene, where those of its images are.
     let session = args.run.session(&args.scene, Some(&args.output))?;
     let what = LocateJobs { scene: Arc::new(scene), config, seed: args.run.seed };
@@ -72,21 +73,26 @@ fn warn_of_scene(warnings: &[String]) {
     }
 }
 
-/// The photo of that name, or the last by name.
-fn find_target(wanted: Option<&str>, files: &[(String, std::path::PathBuf)]) -> Result<String> {
-    let names = || files.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>().join(", ");
-    let found = match wanted {
-        Some(wanted) => {
-            files.iter().find(|(name, _)| name == wanted || name.ends_with(&format!("/{wanted}")))
+/// The only photo of that name, or the last by name.
+fn find_target(wanted: Option<&str>, files: &[(String, PathBuf)]) -> Result<String> {
+    let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).collect();
+    let Some(wanted) = wanted else { return Ok(names.last().copied().unwrap_or_default().to_owned()) };
+    if names.contains(&wanted) {
+        return Ok(wanted.to_owned());
+    }
+    let end = format!("/{wanted}");
+    let found: Vec<&str> = names.iter().copied().filter(|name| name.ends_with(&end)).collect();
+    match found[..] {
+        [only] => Ok(only.to_owned()),
+        [] => {
+            let hint = format!("the photos are {}", names.join(", "));
+            Err(Hinted::error(format!("no photo is named {wanted}"), hint))
         }
-        None => files.last(),
-    };
-    found.map(|(name, _)| name.clone()).ok_or_else(|| {
-        Hinted::error(
-            format!("no photo is named {}", wanted.unwrap_or_default()),
-            format!("the photos are {}", names()),
-        )
-    })
+        _ => {
+            let hint = format!("name its folder as well: one of {}", found.join(", "));
+            Err(Hinted::error(format!("{} photos are named {wanted}", found.len()), hint))
+        }
+    }
 }
 
 /// Tab-separated: name, verdict, method, inliers, centre, rotation.
@@ -146,7 +152,30 @@ fn write_results(
     let centres: Vec<_> =
         markers.iter().map(|marker| (marker.world_from_camera.translation, marker.color)).collect();
     write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes())?;
-    write_colmap(&folder.join("colmap"), &merged, &[])?;
+    match colmap_lacks(&merged) {
+        Some(lack) => print::note(&format!("warning: no COLMAP model is written: {lack}")),
+        None => write_colmap(&folder.join("colmap"), &merged, &[])?,
+    }
     write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?)?;
     write_json(&folder.join("report.json"), &session.report.to_json())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_target_s_name_has_to_fit_one_photo() {
+        let names = ["east/0.jpg", "west/0.jpg", "west/1.jpg"];
+        let files = names.map(|name| (name.to_owned(), PathBuf::from(name)));
+        let find = |wanted| find_target(wanted, &files);
+        assert_eq!(find(None).unwrap(), "west/1.jpg");
+        assert_eq!(find(Some("1.jpg")).unwrap(), "west/1.jpg");
+        assert_eq!(find(Some("west/0.jpg")).unwrap(), "west/0.jpg");
+        let error = find(Some("0.jpg")).unwrap_err();
+        let hint = error.downcast_ref::<Hinted>().unwrap().hint();
+        assert!(error.to_string().contains("2 photos are named 0.jpg"), "{error}");
+        assert!(hint.ends_with("east/0.jpg, west/0.jpg"), "{hint}");
+        assert!(find(Some("t/1.jpg")).unwrap_err().to_string().contains("no photo is named t/1.jpg"));
+    }
 }

@@ -1,5 +1,5 @@
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use serde::Deserialize;
@@ -19,6 +19,8 @@ struct CamerasFile {
 /// Known cameras, by image.
 #[derive(Debug, Clone, Default)]
 pub struct CameraBook {
+    /// Where they were read from.
+    pub(super) file: Option<PathBuf>,
     by_image: BTreeMap<String, Camera>,
 }
 
@@ -44,11 +46,16 @@ impl CameraBook {
             })?;
             by_image.insert(image, camera.clone());
         }
-        Ok(Self { by_image })
+        Ok(Self { file: Some(path.to_owned()), by_image })
     }
 
     /// The camera of an image, if the file names it.
-    pub fn find(&self, name: &str) -> Option<&Camera> {
-        find_by_name(&self.by_image, name)
+    pub fn find(&self, name: &str, path: &Path) -> Option<&Camera> {
+        find_by_name(&self.by_image, name, path)
+    }
+
+    /// The first image that the file names.
+    pub(super) fn first_name(&self) -> Option<&str> {
+        self.by_image.keys().next().map(String::as_str)
     }
 }

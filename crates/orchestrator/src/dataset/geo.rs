@@ -24,36 +24,141 @@ pub struct GeoBook {
     by_image: BTreeMap<String, Wgs84>,
 }
 
+/// Where in a line the fields are, counted from 0.
+#[derive(Debug, Clone, Copy)]
+struct Columns {
+    name: usize,
+    lat: usize,
+    lon: usize,
+    alt: Option<usize>,
+}
+
+impl Columns {
+    /// Those of a table without a header.
+    const UNNAMED: Self = Self { name: 0, lat: 1, lon: 2, alt: Some(3) };
+
+    /// Those that a header names.
+    fn named(header: &[&str]) -> Result<Self> {
+        let names: Vec<String> = header.iter().map(|name| name.to_lowercase()).collect();
+        for (at, name) in names.iter().enumerate() {
+            let known = ["name", "lat", "lon", "alt"].contains(&name.as_str());
+            anyhow::ensure!(known, "unknown column `{}`", header[at]);
+            anyhow::ensure!(!names[..at].contains(name), "two columns `{name}`");
+        }
+        let place = |wanted: &str| names.iter().position(|name| name == wanted);
+        let needed = |wanted: &str| place(wanted).with_context(|| format!("no column `{wanted}`"));
+        Ok(Self { name: needed("name")?, lat: needed("lat")?, lon: needed("lon")?, alt: place("alt") })
+    }
+
+    /// The image and its position in a line.
+    fn read(self, fields: &[&str]) -> Option<(String, Wgs84)> {
+        let field = |at: usize| fields.get(at).copied().unwrap_or_default();
+        let number = |at: usize| field(at).parse::<f64>().ok();
+        let alt = match self.alt {
+            Some(at) if !field(at).is_empty() => number(at)?,
+            _ => 0.0,
+        };
+        let place = Wgs84 { lat: number(self.lat)?, lon: number(self.lon)?, alt };
+        let name = field(self.name);
+        (place.is_valid() && !name.is_empty()).then(|| (name.to_owned(), place))
+    }
+}
+
 impl GeoBook {
-    /// Reads a `geo.csv`: a header line `name,lat,lon,alt`, then one image a line; `alt` may be missing.
+    /// Reads a `geo.csv`: one image a line, `name,lat,lon,alt`; `alt` may be missing. A first line of these names, in
+    /// any order, tells the columns.
     ///
     /// # Errors
     /// With file and line.
     pub fn read(path: &Path) -> Result<Self> {
         let shown = path.display();
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {shown}"))?;
+        // Spreadsheet programs put a byte order mark before the first name.
+        let text = text.trim_start_matches('\u{feff}');
+        let mut columns = None;
         let mut by_image = BTreeMap::new();
-        for (at, line) in text.lines().enumerate().skip(1).filter(|(_, line)| !line.trim().is_empty()) {
+        for (at, line) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
             let fields: Vec<&str> = line.split(',').map(str::trim).collect();
-            let number = |i: usize| fields.get(i).and_then(|text| text.parse::<f64>().ok());
-            let place = match (number(1), number(2)) {
-                (Some(lat), Some(lon)) => Wgs84 { lat, lon, alt: number(3).unwrap_or(0.0) },
-                _ => Wgs84 { lat: f64::NAN, lon: f64::NAN, alt: 0.0 },
+            let wrong = |what: &str| {
+                let message = format!("{shown}, line {}: {what}", at + 1);
+                Hinted::error(message, "each line is name,lat,lon,alt in WGS84 degrees and metres")
             };
-            if !place.is_valid() {
-                let message = format!("{shown}, line {}: `{line}` is no position", at + 1);
-                return Err(Hinted::error(
-                    message,
-                    "each line is name,lat,lon,alt in WGS84 degrees and metres",
-                ));
-            }
-            by_image.insert(fields[0].to_owned(), place);
+            let known = match columns {
+                Some(known) => known,
+                None if fields.iter().skip(1).any(|field| field.parse::<f64>().is_ok()) => Columns::UNNAMED,
+                None => {
+                    let header = Columns::named(&fields);
+                    let no_header = |error| wrong(&format!("`{line}` is no header: {error}"));
+                    columns = Some(header.map_err(no_header)?);
+                    continue;
+                }
+            };
+            columns = Some(known);
+            let (name, place) =
+                known.read(&fields).ok_or_else(|| wrong(&format!("`{line}` is no position")))?;
+            by_image.insert(name, place);
         }
         Ok(Self { by_image })
     }
 
     /// The position of an image, if the table names it.
-    pub fn find(&self, name: &str) -> Option<Wgs84> {
-        find_by_name(&self.by_image, name).copied()
+    pub fn find(&self, name: &str, path: &Path) -> Option<Wgs84> {
+        find_by_name(&self.by_image, name, path).copied()
+    }
+
+    /// The first image that the table names.
+    pub(super) fn first_name(&self) -> Option<&str> {
+        self.by_image.keys().next().map(String::as_str)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> Result<GeoBook> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("geo.csv");
+        std::fs::write(&path, text).unwrap();
+        GeoBook::read(&path)
+    }
+
+    fn place(book: &GeoBook, name: &str) -> [f64; 3] {
+        let place = book.find(name, Path::new(name)).unwrap();
+        [place.lat, place.lon, place.alt]
+    }
+
+    #[test]
+    fn columns_are_read_by_the_names_of_the_header() {
+        let book = read("\u{feff}Name, lon, lat, alt\r\np/a.png,8.5,47.25,400\r\n\r\np/b.png,8.5,47.5,\r\n")
+            .unwrap();
+        assert_eq!(place(&book, "p/a.png"), [47.25, 8.5, 400.0]);
+        assert_eq!(place(&book, "p/b.png"), [47.5, 8.5, 0.0]);
+        let book = read("lat,lon,name\n47.25,8.5,a.png\n").unwrap();
+        assert_eq!(place(&book, "a.png"), [47.25, 8.5, 0.0]);
+    }
+
+    #[test]
+    fn a_table_without_a_header_is_read_from_its_first_line() {
+        let book = read("a.png,47.25,8.5,400\nb.png,47.5,8.5\n").unwrap();
+        assert_eq!(place(&book, "a.png"), [47.25, 8.5, 400.0]);
+        assert_eq!(place(&book, "b.png"), [47.5, 8.5, 0.0]);
+    }
+
+    #[test]
+    fn what_is_no_header_or_no_number_is_named_with_its_line() {
+        let said = |text: &str| read(text).unwrap_err().to_string();
+        assert!(
+            said("image,latitude,longitude\na,1,2\n").contains("line 1: `image,latitude,longitude` is no")
+        );
+        assert!(said("name,lat,lon,altitude\na,1,2,3\n").contains("unknown column `altitude`"));
+        assert!(said("name,lat,alt\na,1,2\n").contains("no column `lon`"));
+        assert!(said("name,lat,lon,lat\na,1,2,1\n").contains("two columns `lat`"));
+        for wrong in ["a,4x,8,0", "a,47,,0", "a,47,8,high", "a,47", "a,47,8,nan", "a,91,8,0", ",47,8,0"] {
+            assert!(said(&format!("name,lat,lon,alt\n\n{wrong}\n")).contains("line 3: "), "{wrong}");
+        }
+        for wrong in ["a,4x,8,0", "a,47,8,high", "7,4x,8"] {
+            assert!(said(&format!("{wrong}\n")).contains("line 1: "), "{wrong}");
+        }
     }
 }

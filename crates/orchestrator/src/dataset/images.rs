@@ -1,9 +1,11 @@
-use std::path::{Path, PathBuf};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Component, Path, PathBuf};
 
 use anyhow::{Context, Result};
 use rayon::prelude::*;
-use setloc_features::{Camera, Wgs84};
+use setloc_features::{Camera, CameraSource, Wgs84};
 
+use super::remarks::{Given, warnings_of};
 use super::{CameraBook, GeoBook, GeoSource};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
@@ -15,7 +17,7 @@ const ENDINGS: [&str; 8] = ["jpg", "jpeg", "png", "tif", "tiff", "webp", "bmp", 
 /// An image to work on.
 #[derive(Debug, Clone)]
 pub struct SourceImage {
-    /// Folder and file name: how people and result files call it.
+    /// Folder and file name, with more folders where needed: how people and result files call it.
     pub name: String,
     /// Where it is.
     pub path: PathBuf,
@@ -25,12 +27,21 @@ pub struct SourceImage {
     pub camera: Camera,
     /// Whether the intrinsics are known and stay.
     pub camera_fixed: bool,
-    /// Where the camera comes from, for people.
-    pub camera_source: String,
+    /// Where the camera comes from.
+    pub camera_origin: CameraOrigin,
     /// Measured position.
     pub position: Option<Wgs84>,
     /// Mask image.
     pub mask: Option<(PathBuf, ContentHash)>,
+}
+
+/// Where an image's camera comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CameraOrigin {
+    /// From `cameras.json`.
+    Listed,
+    /// From the image itself, or from nothing.
+    Guessed(CameraSource),
 }
 
 /// An image that cannot be used, and why.
@@ -49,9 +60,11 @@ pub struct ImageFolder {
     pub images: Vec<SourceImage>,
     /// Images that cannot be used.
     pub skipped: Vec<SkippedImage>,
+    /// What is worth saying of the usable ones and of what was given with them.
+    pub warnings: Vec<String>,
 }
 
-/// Image files of folders (not their subfolders) and single files: names and paths, sorted by name.
+/// Image files of folders (not their subfolders) and single files: unique names and paths, sorted by name.
 ///
 /// # Errors
 /// When a path does not exist, or no image is there.
@@ -72,42 +85,104 @@ pub fn list_images(paths: &[PathBuf]) -> Result<Vec<(String, PathBuf)>> {
             files.push(path.clone());
         }
     }
-    let mut named: Vec<(String, PathBuf)> = files.into_iter().map(|path| (short_name(&path), path)).collect();
-    named.sort();
-    named.dedup_by(|a, b| a.1 == b.1);
-    if named.is_empty() {
+    // One file is one image, however its folder is written.
+    let mut seen = BTreeSet::new();
+    files.retain(|path| seen.insert(real_path(path)));
+    if files.is_empty() {
         let shown: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
         let hint = format!("give a folder with images ({}) or image files", ENDINGS.join(", "));
         return Err(Hinted::error(format!("no images in {}", shown.join(", ")), hint));
     }
-    for at in 1..named.len() {
-        if named[at].0 == named[at - 1].0 {
-            named[at].0 += " (2)";
-        }
-    }
+    let mut named: Vec<(String, PathBuf)> = names_of(&files).into_iter().zip(files).collect();
+    named.sort();
     Ok(named)
 }
 
-/// Folder and file name.
-fn short_name(path: &Path) -> String {
-    let text = |part: Option<&std::ffi::OsStr>| part.map(|part| part.to_string_lossy().into_owned());
+/// Folder and file name; where those of two folders are the same, as many folders more as tell them apart, for all
+/// files of these folders.
+fn names_of(files: &[PathBuf]) -> Vec<String> {
+    let whole: Vec<PathBuf> = files.iter().map(|path| whole_path(path)).collect();
+    let folder_of = |at: usize| whole[at].parent().unwrap_or(Path::new(""));
+    let parts: Vec<Vec<String>> = whole.iter().map(|path| parts_of(path)).collect();
+    let mut lengths: BTreeMap<&Path, usize> = (0..files.len()).map(|at| (folder_of(at), 2)).collect();
+    loop {
+        let name = |at: usize| {
+            let length = lengths[folder_of(at)];
+            parts[at][parts[at].len().saturating_sub(length)..].join("/")
+        };
+        let mut names: Vec<String> = (0..files.len()).map(name).collect();
+        let mut by_name: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
+        for (at, name) in names.iter().enumerate() {
+            by_name.entry(name).or_default().push(at);
+        }
+        let alike = by_name.values().filter(|files| files.len() > 1).flatten();
+        let longer: BTreeSet<&Path> =
+            alike.filter(|&&at| lengths[folder_of(at)] < parts[at].len()).map(|&at| folder_of(at)).collect();
+        if longer.is_empty() {
+            number_alike(&mut names);
+            return names;
+        }
+        for folder in longer {
+            *lengths.entry(folder).or_default() += 1;
+        }
+    }
+}
+
+/// Numbers names that are still the same: of files whose names differ in what is no text.
+fn number_alike(names: &mut [String]) {
+    let mut taken = BTreeSet::new();
+    for name in names {
+        let numbered = (2..).map(|number| format!("{name} ({number})"));
+        let free = std::iter::once(name.clone()).chain(numbered).find(|name| !taken.contains(name));
+        *name = free.unwrap_or_default();
+        taken.insert(name.clone());
+    }
+}
+
+fn parts_of(path: &Path) -> Vec<String> {
+    let normal = |part| match part {
+        Component::Normal(text) => Some(text.to_string_lossy().into_owned()),
+        _ => None,
+    };
+    path.components().filter_map(normal).collect()
+}
+
+/// The path from the root without `..`; links keep their names.
+pub(super) fn whole_path(path: &Path) -> PathBuf {
     let whole = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
-    let folder = whole.parent().and_then(|folder| text(folder.file_name()));
-    let file = text(whole.file_name()).unwrap_or_default();
-    folder.map_or(file.clone(), |folder| format!("{folder}/{file}"))
+    let parts: Vec<Component<'_>> = whole.components().collect();
+    let Some(last) = parts.iter().rposition(|part| *part == Component::ParentDir) else { return whole };
+    let (climbed, below) = parts.split_at(last + 1);
+    let folder = climbed.iter().collect::<PathBuf>().canonicalize();
+    folder.map_or_else(|_| whole.clone(), |folder| folder.join(below.iter().collect::<PathBuf>()))
+}
+
+/// The path from the root without links in its folders.
+fn real_path(path: &Path) -> PathBuf {
+    let whole = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    let (folder, file) = (whole.parent(), whole.file_name());
+    let folder = folder.and_then(|folder| folder.canonicalize().ok());
+    folder.zip(file).map_or(whole.clone(), |(folder, file)| folder.join(file))
 }
 
 impl ImageFolder {
     /// Reads hash, size, camera and position of the named files; what is no image is skipped with its reason.
     ///
     /// # Errors
-    /// When not a single file is readable.
+    /// When not a single file is readable, or there is no folder of masks.
     pub fn read(
         files: &[(String, PathBuf)],
         cameras: &CameraBook,
         geo: &GeoSource,
         masks: Option<&Path>,
     ) -> Result<Self> {
+        if let Some(folder) = masks.filter(|folder| !folder.is_dir()) {
+            let message = format!("{} is no folder", folder.display());
+            return Err(Hinted::error(
+                message,
+                "--masks names a folder of mask images, as `masks/a.jpg.png`",
+            ));
+        }
         let table = match geo {
             GeoSource::Table(path) => GeoBook::read(path)?,
             GeoSource::None | GeoSource::Exif => GeoBook::default(),
@@ -119,7 +194,7 @@ impl ImageFolder {
                 let skip =
                     |error: anyhow::Error| SkippedImage { name: name.clone(), reason: format!("{error:#}") };
                 let mut image = read_image(name, path, cameras, geo).map_err(skip)?;
-                image.position = image.position.or_else(|| table.find(name));
+                image.position = image.position.or_else(|| table.find(name, path));
                 image.mask = masks.map(|folder| find_mask(folder, path)).transpose().map_err(skip)?.flatten();
                 Ok(image)
             })
@@ -138,6 +213,7 @@ impl ImageFolder {
                 format!("none of {} files is a readable image ({})", files.len(), reasons.join("; "));
             return Err(Hinted::error(message, "check the files with an image viewer"));
         }
+        folder.warnings = warnings_of(&folder.images, &Given { cameras, geo, table: &table, masks });
         Ok(folder)
     }
 }
@@ -147,13 +223,13 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
     anyhow::ensure!(!bytes.is_empty(), "the file is empty");
     let info = stages::probe(&bytes, &stages::DecodeLimits::default()).context("not a readable image")?;
     let known =
-        cameras.find(name).filter(|camera| (camera.width, camera.height) == (info.width, info.height));
-    let (camera, camera_fixed, camera_source) = if let Some(camera) = known {
-        (camera.clone(), true, "cameras.json".to_owned())
+        cameras.find(name, path).filter(|camera| (camera.width, camera.height) == (info.width, info.height));
+    let (camera, camera_fixed, camera_origin) = if let Some(camera) = known {
+        (camera.clone(), true, CameraOrigin::Listed)
     } else {
         let (camera, source) = stages::guess_camera(&info);
         let fixed = camera.is_panoramic();
-        (camera, fixed, source.to_string())
+        (camera, fixed, CameraOrigin::Guessed(source))
     };
     let exif = (*geo == GeoSource::Exif).then_some(info.metadata.gps).flatten();
     let position =
@@ -166,7 +242,7 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
         hash,
         camera,
         camera_fixed,
-        camera_source,
+        camera_origin,
         position,
         mask: None,
     })
@@ -185,4 +261,73 @@ fn find_mask(folder: &Path, image: &Path) -> Result<Option<(PathBuf, ContentHash
         Ok((path, ContentHash::of(&bytes)))
     })
     .transpose()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Makes files and lists folders; the names.
+    fn names(files: &[&str], folders: &[&str]) -> Vec<String> {
+        let root = tempfile::tempdir().unwrap();
+        for file in files {
+            let path = root.path().join(file);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, "").unwrap();
+        }
+        let folders: Vec<PathBuf> = folders.iter().map(|folder| root.path().join(folder)).collect();
+        list_images(&folders).unwrap().into_iter().map(|(name, _)| name).collect()
+    }
+
+    #[test]
+    fn folders_of_one_name_are_told_apart_by_those_above() {
+        let days = ["day1/panoramas", "day2/panoramas", "day3/panoramas", "night"];
+        let files = ["day1/panoramas/0.png", "day2/panoramas/0.png", "day3/panoramas/0.png", "night/0.png"];
+        assert_eq!(names(&files, &days), files);
+        // All files of a folder are called alike, so that they stay side by side.
+        let more = ["day1/panoramas/0.png", "day1/panoramas/1.png", "day2/panoramas/0.png"];
+        assert_eq!(names(&more, &days[..2]), more);
+        assert_eq!(names(&more, &days[..1]), ["panoramas/0.png", "panoramas/1.png"]);
+        // Some need more folders than others.
+        let deep = ["a/x/p/0.png", "b/x/p/0.png", "b/y/p/0.png"];
+        assert_eq!(names(&deep, &["a/x/p", "b/x/p", "b/y/p"]), ["a/x/p/0.png", "b/x/p/0.png", "y/p/0.png"]);
+    }
+
+    #[test]
+    fn images_with_longer_names_are_found_by_short_and_long_ones() {
+        let root = tempfile::tempdir().unwrap();
+        let days = ["day1", "day2", "day3"].map(|day| root.path().join(day).join("panoramas"));
+        for (shade, day) in days.iter().enumerate() {
+            std::fs::create_dir_all(day).unwrap();
+            let image = image::GrayImage::from_pixel(40, 30, image::Luma([shade as u8]));
+            image.save(day.join("0.png")).unwrap();
+        }
+        let (table, cameras) = (root.path().join("geo.csv"), root.path().join("cameras.json"));
+        let positions = "day1/panoramas/0.png,1,8\nday2/panoramas/0.png,2,8\npanoramas/0.png,3,8\n";
+        std::fs::write(&table, positions).unwrap();
+        let camera = Camera::from_focal_guess(40, 30, 77.0);
+        let listed = serde_json::json!({ "cameras": { "c": camera }, "images": { "panoramas/0.png": "c" } });
+        std::fs::write(&cameras, listed.to_string()).unwrap();
+        let book = CameraBook::read(&cameras).unwrap();
+        let read =
+            ImageFolder::read(&list_images(&days).unwrap(), &book, &GeoSource::Table(table), None).unwrap();
+        let latitudes: Vec<f64> = read.images.iter().map(|image| image.position.unwrap().lat).collect();
+        assert_eq!(latitudes, [1.0, 2.0, 3.0]);
+        assert!(read.images.iter().all(|image| image.camera == camera && image.camera_fixed));
+        assert!(read.warnings.is_empty(), "{:?}", read.warnings);
+    }
+
+    #[test]
+    fn one_file_is_listed_once_however_it_is_written() {
+        let given = ["p", "p/0.png", "p/../p", "./p/0.png"];
+        assert_eq!(names(&["p/0.png", "p/1.png"], &given), ["p/0.png", "p/1.png"]);
+        assert_eq!(names(&["p/0.png", "q/1.png"], &["q/../p"]), ["p/0.png"]);
+    }
+
+    #[test]
+    fn names_that_are_still_the_same_are_numbered() {
+        let mut names = ["a", "a", "a (2)", "a"].map(str::to_owned);
+        number_alike(&mut names);
+        assert_eq!(names, ["a", "a (2)", "a (2) (2)", "a (3)"]);
+    }
 }

@@ -1,11 +1,13 @@
+use std::collections::BTreeSet;
 use std::fmt::Write;
 use std::path::Path;
 
 use anyhow::Result;
 use rayon::prelude::*;
-use setloc_features::ImageFeatures;
-use setloc_sfm::{Reconstruction, ReconstructionImage, ReconstructionPoint};
+use setloc_features::{ImageFeatures, Keypoint};
+use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage, ReconstructionPoint};
 
+use crate::error::Hinted;
 use crate::store::write_pieces_atomically;
 
 /// Points whose lines are made, and written, at once.
@@ -14,35 +16,57 @@ const POINTS_OF_PIECE: usize = 2048;
 const BYTES_OF_POINT: usize = 128;
 const BYTES_OF_KEYPOINT: usize = 26;
 
+/// What COLMAP's camera models cannot hold of a model's registered images; `None` when they hold all.
+pub fn colmap_lacks(model: &Reconstruction) -> Option<String> {
+    model.registered().find_map(|id| {
+        let (camera, name) = (model.camera_of(id), &model.images[id.index()].name);
+        let kind = camera.model.name();
+        if camera.model.colmap_id().is_none() {
+            return Some(format!("COLMAP has no camera model {kind}, which {name} has"));
+        }
+        // Only a panorama may have more, those of its crop.
+        let cropped = camera.params.len() > camera.model.num_params();
+        cropped.then(|| format!("COLMAP's {kind} is a whole panorama, and {name} is cropped"))
+    })
+}
+
 /// Writes a model as COLMAP's `cameras.txt`, `images.txt` and `points3D.txt`.
 ///
 /// Ids count from 1. COLMAP wants camera-from-world poses. `features[i]` belongs to image `i`; without it the line of
-/// 2D points stays empty.
+/// 2D points stays empty, and tracks have no element in that image.
 ///
 /// # Errors
-/// When a file cannot be written.
+/// When COLMAP lacks a camera's model ([`colmap_lacks`]) or a file cannot be written.
 pub fn write_colmap(
     folder: &Path,
     model: &Reconstruction,
     features: &[Option<&ImageFeatures>],
 ) -> Result<()> {
-    let mut cameras = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
-    for (at, camera) in model.cameras.iter().enumerate() {
-        let name = serde_json::to_value(camera.model)?;
-        let name = name.as_str().unwrap_or_default();
-        let params: Vec<String> = camera.params.iter().map(f64::to_string).collect();
-        writeln!(cameras, "{} {name} {} {} {}", at + 1, camera.width, camera.height, params.join(" "))?;
+    if let Some(lack) = colmap_lacks(model) {
+        return Err(Hinted::error(lack, "`--format json` has every camera model"));
     }
-    let mut points_of_image: Vec<Vec<(u32, usize)>> = vec![Vec::new(); model.images.len()];
+    let used: BTreeSet<CameraId> = model.registered().map(|id| model.images[id.index()].camera).collect();
+    let mut cameras = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
+    for id in used {
+        let camera = &model.cameras[id.index()];
+        let (name, width, height) = (camera.model.name(), camera.width, camera.height);
+        let params: Vec<String> = camera.params.iter().map(f64::to_string).collect();
+        writeln!(cameras, "{} {name} {width} {height} {}", id.0 + 1, params.join(" "))?;
+    }
+    // Keypoints that are written, and the point that each of them sees, 0 for none.
+    let keypoints_of = |(at, image): (usize, &ReconstructionImage)| {
+        let features = features.get(at).copied().flatten().filter(|_| image.world_from_camera.is_some());
+        features.map_or(&[][..], |features| &features.keypoints)
+    };
+    let keypoints: Vec<&[Keypoint]> = model.images.iter().enumerate().map(keypoints_of).collect();
+    let mut seen: Vec<Vec<usize>> = keypoints.iter().map(|keypoints| vec![0; keypoints.len()]).collect();
     for (at, point) in model.points.iter().enumerate() {
         for observation in &point.track {
-            points_of_image[observation.image.index()].push((observation.feature, at + 1));
+            if let Some(id @ 0) = seen[observation.image.index()].get_mut(observation.feature as usize) {
+                *id = at + 1;
+            }
         }
     }
-    points_of_image.par_iter_mut().for_each(|points| {
-        points.sort_unstable();
-        points.dedup_by_key(|(feature, _)| *feature);
-    });
     let points = |(piece, points): (usize, &[ReconstructionPoint])| -> Result<String, std::fmt::Error> {
         let mut lines = String::with_capacity(points.len() * BYTES_OF_POINT);
         for (at, point) in points.iter().enumerate() {
@@ -50,15 +74,16 @@ pub fn write_colmap(
             let id = piece * POINTS_OF_PIECE + at + 1;
             write!(lines, "{id} {} {} {} {r} {g} {b} {:.4}", p.x, p.y, p.z, point.error_sigma)?;
             for observation in &point.track {
-                write!(lines, " {} {}", observation.image.0 + 1, observation.feature)?;
+                if seen[observation.image.index()].get(observation.feature as usize) == Some(&id) {
+                    write!(lines, " {} {}", observation.image.0 + 1, observation.feature)?;
+                }
             }
             lines.push('\n');
         }
         Ok(lines)
     };
     let image = |(at, image): (usize, &ReconstructionImage)| -> Result<String, std::fmt::Error> {
-        let keypoints = features.get(at).copied().flatten().map_or(&[][..], |features| &features.keypoints);
-        let mut lines = String::with_capacity(512 + keypoints.len() * BYTES_OF_KEYPOINT);
+        let mut lines = String::with_capacity(512 + keypoints[at].len() * BYTES_OF_KEYPOINT);
         let Some(pose) = image.world_from_camera else { return Ok(lines) };
         let camera_from_world = pose.inverse();
         let (q, t) = (camera_from_world.rotation.quaternion(), camera_from_world.translation);
@@ -66,18 +91,17 @@ pub fn write_colmap(
         writeln!(lines, "{} {} {} {} {} {} {} {} {ids}", at + 1, q.w, q.i, q.j, q.k, t.x, t.y, t.z)?;
         // Nearly all of the export: millions of numbers.
         let mut number = zmij::Buffer::new();
-        let mut points = points_of_image[at].iter().peekable();
-        for (index, keypoint) in keypoints.iter().enumerate() {
+        for (keypoint, point) in keypoints[at].iter().zip(&seen[at]) {
             for coordinate in [keypoint.x, keypoint.y] {
                 lines.push_str(number.format(coordinate));
                 lines.push(' ');
             }
-            match points.next_if(|(feature, _)| *feature as usize == index) {
-                Some((_, id)) => write!(lines, "{id} ")?,
-                None => lines.push_str("-1 "),
+            match point {
+                0 => lines.push_str("-1 "),
+                id => write!(lines, "{id} ")?,
             }
         }
-        if !keypoints.is_empty() {
+        if !keypoints[at].is_empty() {
             lines.pop();
         }
         lines.push('\n');
@@ -99,4 +123,97 @@ pub fn write_colmap(
         let pieces = std::iter::once(*head).chain(lines.iter().map(String::as_str));
         write_pieces_atomically(&folder.join(name), pieces.map(str::as_bytes))
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use nalgebra::Vector3;
+    use setloc_features::{Camera, CameraModel};
+    use setloc_sfm::{ImageId, Observation, Rigid};
+
+    use super::*;
+
+    fn scene(camera: Camera, tracks: &[&[(u32, u32)]]) -> Reconstruction {
+        let image = |at: u32| ReconstructionImage {
+            name: format!("{at}.jpg"),
+            camera: CameraId(0),
+            world_from_camera: (at < 2).then(Rigid::identity),
+        };
+        let point = |track: &&[(u32, u32)]| ReconstructionPoint {
+            position: Vector3::new(1.0, 2.0, 3.0),
+            color: [1, 2, 3],
+            error_sigma: 1.0,
+            covariance: None,
+            track: track
+                .iter()
+                .map(|&(image, feature)| Observation { image: ImageId(image), feature })
+                .collect(),
+            aligned: None,
+        };
+        Reconstruction {
+            cameras: vec![camera, Camera::equirectangular(8, 4)],
+            images: (0..3).map(image).collect(),
+            points: tracks.iter().map(point).collect(),
+            ..Reconstruction::default()
+        }
+    }
+
+    /// The point of every keypoint by `images.txt`, and the keypoints of every point by `points3D.txt`.
+    type Links = (BTreeMap<(usize, usize), usize>, BTreeMap<usize, Vec<(usize, usize)>>);
+
+    fn written(model: &Reconstruction, features: &[Option<&ImageFeatures>]) -> Links {
+        let folder = tempfile::tempdir().unwrap();
+        write_colmap(folder.path(), model, features).unwrap();
+        let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
+        let numbers = |line: &str| -> Vec<f64> {
+            line.split_whitespace().map(|field| field.parse().unwrap_or(f64::NAN)).collect()
+        };
+        let (images, points, cameras) = (read("images.txt"), read("points3D.txt"), read("cameras.txt"));
+        assert_eq!(cameras.lines().count(), 2, "a camera without an image: {cameras}");
+        let mut points_of_keypoints = BTreeMap::new();
+        for pair in images.lines().skip(2).collect::<Vec<_>>().chunks(2) {
+            let image = numbers(pair[0])[0] as usize;
+            for (index, keypoint) in numbers(pair[1]).chunks(3).enumerate().filter(|(_, k)| k[2] >= 0.0) {
+                points_of_keypoints.insert((image, index), keypoint[2] as usize);
+            }
+        }
+        let track = |line: &str| {
+            let fields = numbers(line);
+            (fields[0] as usize, fields[8..].chunks(2).map(|at| (at[0] as usize, at[1] as usize)).collect())
+        };
+        (points_of_keypoints, points.lines().skip(1).map(track).collect())
+    }
+
+    #[test]
+    fn tracks_and_two_dimensional_points_name_each_other() {
+        let keypoint = Keypoint { x: 1.0, y: 2.0, size: 3.0, orientation: 0.0, noise_px: 0.5 };
+        let features = ImageFeatures { keypoints: vec![keypoint; 3], ..ImageFeatures::default() };
+        // The second point claims a keypoint of the first and one in an image without a pose, the third one that the
+        // image does not have.
+        let tracks: [&[(u32, u32)]; 3] = [&[(0, 1), (1, 2)], &[(0, 2), (1, 2), (2, 0)], &[(0, 0), (1, 7)]];
+        let model = scene(Camera::equirectangular(200, 100), &tracks);
+        let (points, tracks) = written(&model, &[Some(&features); 3]);
+        assert_eq!(points, BTreeMap::from([((1, 1), 1), ((2, 2), 1), ((1, 2), 2), ((1, 0), 3)]));
+        let expected = [(1, vec![(1, 1), (2, 2)]), (2, vec![(1, 2)]), (3, vec![(1, 0)])];
+        assert_eq!(tracks, BTreeMap::from(expected));
+        let (points, tracks) = written(&model, &[]);
+        assert!(points.is_empty() && tracks.len() == 3 && tracks.values().all(Vec::is_empty), "{tracks:?}");
+    }
+
+    #[test]
+    fn cameras_that_colmap_lacks_are_refused_with_their_image() {
+        let refused = |model: CameraModel, params: &[f64]| {
+            let camera = Camera { model, width: 100, height: 50, params: params.to_vec() };
+            let folder = tempfile::tempdir().unwrap();
+            let error = write_colmap(folder.path(), &scene(camera, &[]), &[]).unwrap_err().to_string();
+            assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+            error
+        };
+        let crop = refused(CameraModel::Equirectangular, &[200.0, 100.0, 50.0, 25.0]);
+        assert_eq!(crop, "COLMAP's EQUIRECTANGULAR is a whole panorama, and 0.jpg is cropped");
+        let paper = refused(CameraModel::PaperRectilinear, &[100.0, 50.0, 25.0]);
+        assert_eq!(paper, "COLMAP has no camera model PAPER_RECTILINEAR, which 0.jpg has");
+    }
 }

@@ -1,0 +1,267 @@
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use setloc_features::CameraSource;
+
+use super::{CameraBook, CameraOrigin, GeoBook, GeoSource, ImageFolder, SourceImage};
+use crate::fingerprint::ContentHash;
+
+/// So many of a kind are named in a warning, the others are counted.
+const NAMED: usize = 3;
+const FALLBACK: CameraOrigin = CameraOrigin::Guessed(CameraSource::Fallback);
+
+impl ImageFolder {
+    /// How many cameras come from where; those of unknown focal length are a warning's affair.
+    pub fn camera_summary(&self) -> Option<String> {
+        let mut counts: Vec<(CameraOrigin, usize)> = Vec::new();
+        for image in self.images.iter().filter(|image| image.camera_origin != FALLBACK) {
+            match counts.iter_mut().find(|(origin, _)| *origin == image.camera_origin) {
+                Some((_, count)) => *count += 1,
+                None => counts.push((image.camera_origin, 1)),
+            }
+        }
+        let parts: Vec<String> = counts.into_iter().map(|(origin, count)| in_words(origin, count)).collect();
+        (!parts.is_empty()).then(|| format!("cameras: {}", parts.join(", ")))
+    }
+}
+
+fn in_words(origin: CameraOrigin, count: usize) -> String {
+    let counted = |noun: &str| if count == 1 { format!("1 {noun}") } else { format!("{count} {noun}s") };
+    match origin {
+        CameraOrigin::Listed => format!("{} by cameras.json", counted("image")),
+        CameraOrigin::Guessed(CameraSource::GPano) => format!("{} by GPano metadata", counted("panorama")),
+        CameraOrigin::Guessed(CameraSource::AspectRatio) => {
+            format!("{} by the 2:1 aspect ratio", counted("panorama"))
+        }
+        CameraOrigin::Guessed(CameraSource::ExifFocal35mm) => {
+            format!("{} by EXIF's 35 mm focal length", counted("photo"))
+        }
+        CameraOrigin::Guessed(CameraSource::ExifFocalPlane) => {
+            format!("{} by EXIF's focal length and sensor resolution", counted("photo"))
+        }
+        CameraOrigin::Guessed(source) => format!("{}: {source}", counted("image")),
+    }
+}
+
+/// What images were given with.
+pub(super) struct Given<'g> {
+    pub cameras: &'g CameraBook,
+    pub geo: &'g GeoSource,
+    pub table: &'g GeoBook,
+    pub masks: Option<&'g Path>,
+}
+
+/// What is worth a warning: options that fit no image, cameras that contradict theirs or are guessed, equal images.
+pub(super) fn warnings_of(images: &[SourceImage], given: &Given<'_>) -> Vec<String> {
+    let warnings = [
+        cameras_without_image(images, given.cameras),
+        contradicted_cameras(images, given.cameras),
+        guessed_cameras(images),
+        positions_without_image(images, given.geo, given.table),
+        masks_without_image(images, given.masks),
+        equal_images(images),
+    ];
+    warnings.into_iter().flatten().collect()
+}
+
+fn cameras_without_image(images: &[SourceImage], cameras: &CameraBook) -> Option<String> {
+    let file = cameras.file.as_deref()?;
+    let found = images.iter().any(|image| cameras.find(&image.name, &image.path).is_some());
+    (!found).then(|| fits_none(file, "the camera", cameras.first_name(), images))
+}
+
+fn positions_without_image(images: &[SourceImage], geo: &GeoSource, table: &GeoBook) -> Option<String> {
+    if images.iter().any(|image| image.position.is_some()) {
+        return None;
+    }
+    match geo {
+        GeoSource::None => None,
+        GeoSource::Exif => Some("no image has a position in its EXIF".to_owned()),
+        GeoSource::Table(file) => Some(fits_none(file, "the position", table.first_name(), images)),
+    }
+}
+
+/// One listed name and one image's, so that the difference shows.
+fn fits_none(file: &Path, what: &str, listed: Option<&str>, images: &[SourceImage]) -> String {
+    let listed = listed.map_or_else(|| "it lists none".to_owned(), |name| format!("it lists `{name}`"));
+    let called = images.first().map_or("", |image| &image.name);
+    format!("{} has {what} of no image: {listed}, an image is called `{called}`", file.display())
+}
+
+fn contradicted_cameras(images: &[SourceImage], cameras: &CameraBook) -> Option<String> {
+    let file = cameras.file.as_deref()?;
+    let contradicted: Vec<String> = images
+        .iter()
+        .filter_map(|image| {
+            let (given, actual) = (cameras.find(&image.name, &image.path)?, &image.camera);
+            let differs = (given.width, given.height) != (actual.width, actual.height);
+            let [given, actual] = [given, actual].map(|camera| format!("{}×{}", camera.width, camera.height));
+            differs.then(|| format!("{} is {actual}, its camera {given}", image.name))
+        })
+        .collect();
+    let not_used = format!("{}: cameras of another size than their images are not used", file.display());
+    (!contradicted.is_empty()).then(|| format!("{not_used}: {}", some_of(&contradicted, "images")))
+}
+
+fn guessed_cameras(images: &[SourceImage]) -> Option<String> {
+    let guessed = images.iter().filter(|image| image.camera_origin == FALLBACK);
+    let guessed: Vec<String> = guessed.map(|image| image.name.clone()).collect();
+    let message = "focal length unknown, 1.2 times the longer side assumed (--cameras gives known ones)";
+    (!guessed.is_empty()).then(|| format!("{message}: {}", some_of(&guessed, "photos")))
+}
+
+fn masks_without_image(images: &[SourceImage], masks: Option<&Path>) -> Option<String> {
+    let (folder, image) = (masks?, images.first()?);
+    let found = images.iter().any(|image| image.mask.is_some());
+    let file = image.path.file_name().unwrap_or_default().display();
+    let stem = image.path.file_stem().unwrap_or_default().display();
+    let folder = folder.display();
+    (!found).then(|| {
+        format!("{folder} has the mask of no image: that of {} is {file}.png or {stem}.png", image.name)
+    })
+}
+
+fn equal_images(images: &[SourceImage]) -> Option<String> {
+    let mut first_of: BTreeMap<ContentHash, &str> = BTreeMap::new();
+    let mut pairs = Vec::new();
+    for image in images {
+        match first_of.get(&image.hash) {
+            Some(first) => pairs.push(format!("{first} and {}", image.name)),
+            None => drop(first_of.insert(image.hash, &image.name)),
+        }
+    }
+    (!pairs.is_empty()).then(|| format!("images of equal content: {}", some_of(&pairs, "pairs")))
+}
+
+/// The first of a list, and how many more there are.
+fn some_of(list: &[String], nouns: &str) -> String {
+    let named = list[..list.len().min(NAMED)].join("; ");
+    match list.len().saturating_sub(NAMED) {
+        0 => named,
+        more => format!("{named}; {more} more {nouns}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+    use crate::dataset::list_images;
+
+    struct Folder(tempfile::TempDir);
+
+    impl Folder {
+        /// Images of one shade each, by name, width and height.
+        fn of(images: &[(&str, u32, u32)]) -> Self {
+            let root = tempfile::tempdir().unwrap();
+            std::fs::create_dir(root.path().join("p")).unwrap();
+            for (shade, (name, width, height)) in images.iter().enumerate() {
+                let image = image::GrayImage::from_pixel(*width, *height, image::Luma([shade as u8]));
+                image.save(root.path().join("p").join(name)).unwrap();
+            }
+            Self(root)
+        }
+
+        fn write(&self, name: &str, text: &str) -> PathBuf {
+            let path = self.0.path().join(name);
+            std::fs::write(&path, text).unwrap();
+            path
+        }
+
+        fn read(&self, cameras: &CameraBook, geo: &GeoSource, masks: Option<&Path>) -> ImageFolder {
+            let files = list_images(&[self.0.path().join("p")]).unwrap();
+            ImageFolder::read(&files, cameras, geo, masks).unwrap()
+        }
+
+        fn read_alone(&self) -> ImageFolder {
+            self.read(&CameraBook::default(), &GeoSource::None, None)
+        }
+    }
+
+    fn cameras(width: u32, height: u32, images: &str) -> String {
+        let (w, h) = (f64::from(width), f64::from(height));
+        let lens = serde_json::json!({
+            "model": "SIMPLE_PINHOLE", "width": width, "height": height, "params": [w, w / 2.0, h / 2.0]
+        });
+        format!("{{\"cameras\": {{\"c\": {lens}}}, \"images\": {{{images}}}}}")
+    }
+
+    #[test]
+    fn it_is_said_where_cameras_come_from() {
+        let folder =
+            Folder::of(&[("a.png", 64, 32), ("b.png", 32, 16), ("c.png", 40, 30), ("d.png", 50, 30)]);
+        let book = folder.write("cameras.json", &cameras(40, 30, "\"p/c.png\": \"c\""));
+        let read = folder.read(&CameraBook::read(&book).unwrap(), &GeoSource::None, None);
+        assert_eq!(
+            read.camera_summary().unwrap(),
+            "cameras: 2 panoramas by the 2:1 aspect ratio, 1 image by cameras.json"
+        );
+        assert_eq!(read.warnings.len(), 1, "{:?}", read.warnings);
+        assert!(read.warnings[0].ends_with("(--cameras gives known ones): p/d.png"), "{:?}", read.warnings);
+    }
+
+    #[test]
+    fn cameras_that_fit_no_image_or_not_its_size_are_said() {
+        let folder = Folder::of(&[("a.png", 64, 32)]);
+        let warnings = |cameras: &str| {
+            let book = CameraBook::read(&folder.write("cameras.json", cameras)).unwrap();
+            folder.read(&book, &GeoSource::None, None).warnings
+        };
+        let other = warnings(&cameras(40, 30, "\"q/a.png\": \"c\""));
+        assert!(other.len() == 1 && other[0].contains("it lists `q/a.png`, an image is called `p/a.png`"));
+        let smaller = warnings(&cameras(32, 16, "\"p/a.png\": \"c\""));
+        assert!(
+            smaller.len() == 1 && smaller[0].contains("p/a.png is 64×32, its camera 32×16"),
+            "{smaller:?}"
+        );
+        assert!(warnings(&cameras(64, 32, "\"p/a.png\": \"c\"")).is_empty());
+        assert!(warnings(&cameras(64, 32, ""))[0].contains("it lists none"));
+    }
+
+    #[test]
+    fn positions_and_masks_that_fit_no_image_are_said() {
+        let folder = Folder::of(&[("a.png", 64, 32)]);
+        let none = CameraBook::default();
+        let table = |text: &str| {
+            let table = folder.write("geo.csv", text);
+            folder.read(&none, &GeoSource::Table(table), None).warnings
+        };
+        let other = table("name,lat,lon\npanos/a.png,47,8\n");
+        assert!(other[0].contains("it lists `panos/a.png`, an image is called `p/a.png`"), "{other:?}");
+        assert!(table("a.png,47,8\n").is_empty());
+        let exif = folder.read(&none, &GeoSource::Exif, None).warnings;
+        assert_eq!(exif, ["no image has a position in its EXIF"]);
+        let masks = folder.0.path().join("masks");
+        std::fs::create_dir(&masks).unwrap();
+        let lost = folder.read(&none, &GeoSource::None, Some(&masks)).warnings;
+        assert!(lost[0].ends_with("that of p/a.png is a.png.png or a.png"), "{lost:?}");
+        image::GrayImage::new(64, 32).save(masks.join("a.png")).unwrap();
+        assert!(folder.read(&none, &GeoSource::None, Some(&masks)).warnings.is_empty());
+    }
+
+    #[test]
+    fn a_folder_of_masks_has_to_exist() {
+        let folder = Folder::of(&[("a.png", 64, 32)]);
+        let files = list_images(&[folder.0.path().join("p")]).unwrap();
+        let masks = folder.0.path().join("masks");
+        let error = ImageFolder::read(&files, &CameraBook::default(), &GeoSource::None, Some(&masks));
+        assert!(error.unwrap_err().to_string().contains("masks is no folder"));
+    }
+
+    #[test]
+    fn equal_images_are_said_in_pairs() {
+        let names = ["a.png", "b.png", "c.png", "d.png", "e.png", "f.png"];
+        let folder = Folder::of(&names.map(|name| (name, 64, 32)));
+        assert!(folder.read_alone().warnings.is_empty());
+        let path = |name: &str| folder.0.path().join("p").join(name);
+        std::fs::copy(path("a.png"), path("c.png")).unwrap();
+        let warnings = folder.read_alone().warnings;
+        assert_eq!(warnings, ["images of equal content: p/a.png and p/c.png"]);
+        for name in &names[1..] {
+            std::fs::copy(path("a.png"), path(name)).unwrap();
+        }
+        let warnings = folder.read_alone().warnings;
+        assert!(warnings[0].ends_with("; p/a.png and p/d.png; 2 more pairs"), "{warnings:?}");
+    }
+}
