@@ -45,6 +45,7 @@ use self::{
         PoseHypothesis, Visibility, count_scene_matches, hypothesize, hypothesize_baseline,
         hypothesize_from_pairs, register, visibility,
     },
+    repeated::Underfoot,
     standpoint::Standpoints,
     structure::{PointLimits, complete_and_merge, filter, triangulate_image, triangulate_match},
 };
@@ -56,7 +57,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 16;
+pub const MAPPER_VERSION: u32 = 17;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -277,15 +278,13 @@ pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) ->
         return standpoints.expand(reconstruct_images(params, &standpoints.input(), seed));
     }
     let output = reconstruct_images(params, input, seed);
-    match repeated::without_repeated_side(input, seed) {
-        Some(rest) if rest.contradicts(&output.components) => {
-            let input = MapperInput { pairs: &rest.pairs, putative: &rest.putative, ..input.clone() };
-            let mut output = reconstruct_images(params, &input, seed);
-            output.report.warnings.push(repeated::WARNING.to_owned());
-            output
-        }
-        _ => output,
-    }
+    let better =
+        Underfoot::find(input).and_then(|underfoot| underfoot.better_input(&output.components, seed));
+    let Some((rest, warning)) = better else { return output };
+    let input = MapperInput { pairs: &rest.pairs, putative: &rest.putative, ..input.clone() };
+    let mut output = reconstruct_images(params, &input, seed);
+    output.report.warnings.push(warning);
+    output
 }
 
 fn reconstruct_images(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {

@@ -1,5 +1,7 @@
 //! The quality gate: what in a finished model disagrees with its own evidence.
 
+use std::collections::BTreeMap;
+
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -37,7 +39,7 @@ impl Default for QualityParams {
     }
 }
 
-/// A verified pair whose own geometry the final model contradicts.
+/// A verified pair of which no geometry agrees with the final model; told by the one with most matches.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PairDisagreement {
     /// First image.
@@ -155,29 +157,38 @@ pub fn assess(
     let shared = sum(|counts| &counts.shared, n * n);
     let expected = sum(|counts| &counts.expected, n * n);
     let points_of = sum(|counts| &counts.points_of, n);
+    // Of the geometries of one pair the model can have one only.
+    let mut judged: BTreeMap<(ImageId, ImageId), (PairDisagreement, bool)> = BTreeMap::new();
     for pair in pairs {
         let poses = (
             reconstruction.images[pair.first.index()].world_from_camera,
             reconstruction.images[pair.second.index()].world_from_camera,
         );
         let (Some(first), Some(second)) = poses else { continue };
-        report.pairs += 1;
         let used = shared[pair.first.index() * n + pair.second.index()];
-        let rotation_deg = (second.inverse() * first)
-            .rotation
-            .angle_to(&pair.two_view.second_from_first.rotation)
-            .to_degrees();
-        let unused = used * 5 < pair.two_view.inliers.len();
-        if unused || (rotation_deg > params.max_rotation_deg && pair.two_view.kind == TwoViewKind::General) {
-            report.disagreements.push(PairDisagreement {
-                first: pair.first,
-                second: pair.second,
-                matches: pair.two_view.inliers.len(),
-                used,
-                rotation_deg,
-            });
+        let two_view = &pair.two_view;
+        let found = PairDisagreement {
+            first: pair.first,
+            second: pair.second,
+            matches: two_view.inliers.len(),
+            used,
+            rotation_deg: (second.inverse() * first)
+                .rotation
+                .angle_to(&two_view.second_from_first.rotation)
+                .to_degrees(),
+        };
+        let is_turned = found.rotation_deg > params.max_rotation_deg && two_view.kind == TwoViewKind::General;
+        let agrees = used * 5 >= found.matches && !is_turned;
+        let (kept, any_agrees) =
+            judged.entry((pair.first, pair.second)).or_insert_with(|| (found.clone(), false));
+        *any_agrees |= agrees;
+        if found.matches > kept.matches {
+            *kept = found;
         }
     }
+    report.pairs = judged.len();
+    let disagreements = judged.into_values().filter(|(_, any_agrees)| !any_agrees);
+    report.disagreements = disagreements.map(|(found, _)| found).collect();
     for first in reconstruction.registered() {
         for second in reconstruction.registered().filter(|&second| second > first) {
             let (forth, back) = (first.index() * n + second.index(), second.index() * n + first.index());

@@ -20,6 +20,20 @@ enum Seen {
     Floor { tile: [i32; 2], spot: usize },
 }
 
+/// How much of what two panoramas share matches.
+#[derive(Clone, Copy)]
+struct Matching {
+    /// Each panorama matches the floor as if it stood over the same tile as any other.
+    are_tiles_alike: bool,
+    wall: f64,
+    floor: f64,
+    /// A panorama whose walls match nowhere.
+    without_walls: Option<usize>,
+}
+
+/// Few points of the walls match, and most of the floor.
+const MOSTLY_FLOOR: Matching = Matching { are_tiles_alike: true, wall: 0.3, floor: 0.7, without_walls: None };
+
 struct Room {
     truth: Vec<Rigid>,
     camera: Camera,
@@ -70,16 +84,18 @@ impl Room {
         room
     }
 
-    /// Few points of the walls match, and most of the floor: as if both stood over the same tile, if tiles are alike.
-    fn matches(&self, a: usize, b: usize, are_tiles_alike: bool, rng: &mut ChaCha8Rng) -> Vec<Match> {
+    fn matches(&self, a: usize, b: usize, matching: &Matching, rng: &mut ChaCha8Rng) -> Vec<Match> {
         let apart = (self.truth[b].translation - self.truth[a].translation) / TILE_M;
-        let shift = if are_tiles_alike { [apart.x.round() as i32, apart.z.round() as i32] } else { [0, 0] };
+        let is_alike = matching.are_tiles_alike;
+        let shift = if is_alike { [apart.x.round() as i32, apart.z.round() as i32] } else { [0, 0] };
+        let is_bare = matching.without_walls.is_some_and(|bare| bare == a || bare == b);
+        let [wall, floor] = if is_bare { [0.0, 0.7] } else { [matching.wall, matching.floor] };
         let mut found = Vec::new();
         for (first, seen) in self.seen[a].iter().enumerate() {
             let (wanted, share) = match *seen {
-                Seen::Wall(at) => (Seen::Wall(at), 0.3),
+                Seen::Wall(at) => (Seen::Wall(at), wall),
                 Seen::Floor { tile, spot } => {
-                    (Seen::Floor { tile: [tile[0] + shift[0], tile[1] + shift[1]], spot }, 0.7)
+                    (Seen::Floor { tile: [tile[0] + shift[0], tile[1] + shift[1]], spot }, floor)
                 }
             };
             if let Some(second) = self.seen[b].iter().position(|other| *other == wanted)
@@ -91,14 +107,14 @@ impl Room {
         found
     }
 
-    fn map(&self, are_tiles_alike: bool) -> MapperOutput {
+    fn map(&self, matching: &Matching) -> MapperOutput {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let rays: Vec<_> = self.features.iter().map(|features| features.rays(&self.camera)).collect();
         let names: Vec<String> = (0..rays.len()).map(|at| format!("image_{at}")).collect();
         let (mut pairs, mut putative) = (Vec::new(), Vec::new());
         for (a, b) in (0..rays.len()).flat_map(|a| (a + 1..rays.len()).map(move |b| (a, b))) {
             let (first, second) = (ImageId(a as u32), ImageId(b as u32));
-            let matches = self.matches(a, b, are_tiles_alike, &mut rng);
+            let matches = self.matches(a, b, matching, &mut rng);
             let views = verify_pair(&TwoViewParams::default(), &rays[a], &rays[b], &matches, 7);
             pairs.extend(views.into_iter().map(|two_view| PairGeometry { first, second, two_view }));
             putative.push(PutativePair { first, second, matches });
@@ -116,42 +132,59 @@ impl Room {
         reconstruct(&MapperParams::default(), &input, 5)
     }
 
-    /// Asserts that all images are registered, and returns the largest error of a centre in metres.
-    fn error_m(&self, output: &MapperOutput) -> f64 {
+    /// The images that are not registered, and the largest error of a centre in metres.
+    fn judge(&self, output: &MapperOutput) -> (Vec<usize>, f64) {
         let component = &output.components[0];
-        let poses: Vec<Rigid> = component.images.iter().filter_map(|image| image.world_from_camera).collect();
-        assert_eq!(poses.len(), self.truth.len());
-        let centers = |poses: &[Rigid]| poses.iter().map(|pose| pose.translation).collect::<Vec<_>>();
-        let (found, truth) = (centers(&poses), centers(&self.truth));
+        let (mut lost, mut found, mut truth) = (Vec::new(), Vec::new(), Vec::new());
+        for (at, (image, pose)) in component.images.iter().zip(&self.truth).enumerate() {
+            match image.world_from_camera {
+                Some(placed) => {
+                    found.push(placed.translation);
+                    truth.push(pose.translation);
+                }
+                None => lost.push(at),
+            }
+        }
         let truth_from_world =
             Similarity::from_point_pairs(&found, &truth).expect("centres are not collinear");
         let error = |(at, truth): (&Vector3<f64>, &Vector3<f64>)| {
             (truth_from_world.transform_point(at) - truth).norm()
         };
-        found.iter().zip(&truth).map(error).fold(0.0, f64::max)
+        (lost, found.iter().zip(&truth).map(error).fold(0.0, f64::max))
     }
 }
 
-fn says_so(output: &MapperOutput) -> bool {
-    output.report.warnings.iter().any(|line| line.contains("one side"))
+fn says_so(output: &MapperOutput, words: &str) -> bool {
+    output.report.warnings.iter().any(|line| line.contains(words))
 }
 
 #[test]
 fn a_floor_of_equal_tiles_does_not_fold_the_room() {
     let room = Room::new();
-    let output = room.map(true);
-    assert!(says_so(&output));
-    let error = room.error_m(&output);
+    let output = room.map(&MOSTLY_FLOOR);
+    assert!(says_so(&output, "underfoot only"));
+    let (lost, error) = room.judge(&output);
+    assert!(lost.is_empty() && error < 0.03, "{lost:?}, {error} m");
+}
+
+#[test]
+fn a_panorama_that_only_equal_tiles_hold_is_left_out() {
+    let room = Room::new();
+    let matching = Matching { wall: 0.9, floor: 0.15, without_walls: Some(5), ..MOSTLY_FLOOR };
+    let output = room.map(&matching);
+    assert!(says_so(&output, "nothing else held image_5"), "{:?}", output.report.warnings);
+    let (lost, error) = room.judge(&output);
+    assert_eq!(lost, [5]);
     assert!(error < 0.03, "{error} m");
 }
 
 #[test]
 fn a_floor_without_repetition_is_used() {
     let room = Room::new();
-    let output = room.map(false);
-    assert!(!says_so(&output));
-    let error = room.error_m(&output);
-    assert!(error < 0.02, "{error} m");
+    let output = room.map(&Matching { are_tiles_alike: false, ..MOSTLY_FLOOR });
+    assert!(!says_so(&output, "floor") && !says_so(&output, "underfoot"));
+    let (lost, error) = room.judge(&output);
+    assert!(lost.is_empty() && error < 0.02, "{lost:?}, {error} m");
     let below = output.components[0].points.iter().filter(|point| point.track.len() > 2).count();
     assert!(below > 500, "{below} points");
 }

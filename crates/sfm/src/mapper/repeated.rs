@@ -10,16 +10,20 @@ use super::sides::{compare, count_matches, count_shareable, sees_all_around};
 use super::{MapperInput, PutativePair};
 use crate::{ImageId, PairGeometry, Reconstruction, TwoViewKind, verify_pair};
 
-/// Share of all verified matches that must lie in one-sided geometries for the place to count as one that repeats
-/// itself. Two rendered rooms with floors of exactly repeated tiles have 0.76 and 0.54, two with other floors 0.03 and 0.05,
-/// rendered streets up to 0.16, real ones 0.22 (trees that match nowhere) and 0.27 (a rider moves with the camera), towns nothing.
-const MIN_REPEATED_SHARE: f64 = 0.4;
+/// Share of all verified matches that must lie in one-sided geometries for a model to be judged by the rest. Rendered
+/// rooms with floors of exactly repeated tiles or planks have 0.12 to 0.78, two with other floors 0.03 and 0.05, rendered
+/// streets up to 0.16, real ones 0.22 (trees that match nowhere) and 0.27 (a rider moves with the camera), towns nothing.
+const MIN_REPEATED_SHARE: f64 = 0.2;
 /// Largest angle in degrees from straight down to the middle of what such a geometry explains. One-sided matches of a wall
 /// opposite trees are right ones.
 const MAX_POLE_DEG: f64 = 45.0;
-/// Fewest pairs of the rest by which a model is judged, and the share of their matches that must agree with it.
+/// Fewest pairs by which a model is judged, and the share of their matches that must agree with it. Of the pairs without
+/// what lies underfoot right models have 0.98 to 1.00 (0.58 where a wallpaper repeats itself), folded ones 0.34 and 0.40.
 const MIN_JUDGING_PAIRS: usize = 3;
 const MIN_AGREEMENT: f64 = 0.5;
+/// Share of an image's points that must lie away from what repeats itself underfoot for more than that to hold it. In seven
+/// rendered rooms right images have 0.13 or more, one that the floor folded 0.015.
+const MIN_ELSEWHERE: f64 = 0.05;
 /// Largest angle in degrees between the baseline of such a pair and that of the model.
 const MAX_BASELINE_DEG: f64 = 15.0;
 /// Largest angle in degrees from the middle of what repeats itself to what is left out.
@@ -37,106 +41,174 @@ const MIN_NEAR_SIDE_SHARE: f64 = 0.08;
 const MIN_SIDE_KEYPOINTS: usize = 60;
 
 /// Said of a place whose repeated side was left out.
-pub(super) const WARNING: &str = "most verified matches lie on one side of the panoramas, as on a floor of equal tiles that makes places a whole number of tiles apart look one: that side was left out, and the scene is held by the rest; leaving it out of the features (nadir_cone_deg, masks) is safer";
+const WARNING: &str = "many verified matches lie underfoot only and what the rest tells contradicts them, as on a floor of equal tiles that makes places a whole number of tiles apart look one: that side was left out, and the scene is held by the rest; leaving it out of the features (nadir_cone_deg, masks) is safer";
 
-/// What is left of the matches and pairs of a place that repeats itself underfoot.
+/// Matches and pairs in place of an input's own.
 pub(super) struct Remainder {
-    /// Matches away from the repeated side.
     pub putative: Vec<PutativePair>,
-    /// Geometries of these.
     pub pairs: Vec<PairGeometry>,
 }
 
-impl Remainder {
-    /// Whether the baselines of these pairs contradict a model of all matches.
-    ///
-    /// A floor that is right agrees with the walls; one that folds the model puts the walls anywhere.
-    pub fn contradicts(&self, components: &[Reconstruction]) -> bool {
-        let mut judged: BTreeMap<(ImageId, ImageId), (usize, bool)> = BTreeMap::new();
-        for pair in self.pairs.iter().filter(|pair| pair.two_view.kind != TwoViewKind::PureRotation) {
-            let placed = components.iter().find_map(|component| {
-                let pose = |image: ImageId| component.images[image.index()].world_from_camera;
-                Some(pose(pair.second)?.inverse() * pose(pair.first)?)
-            });
-            let Some(placed) = placed else { continue };
-            let angle = placed.translation.angle(&pair.two_view.second_from_first.translation);
-            let (matches, agrees) = judged.entry((pair.first, pair.second)).or_default();
-            *matches = pair.two_view.inliers.len().max(*matches);
-            *agrees |= angle <= MAX_BASELINE_DEG.to_radians();
-        }
-        let all: usize = judged.values().map(|(matches, _)| matches).sum();
-        let agreeing: usize = judged.values().filter(|(_, agrees)| *agrees).map(|(matches, _)| matches).sum();
-        judged.len() >= MIN_JUDGING_PAIRS && (agreeing as f64) < MIN_AGREEMENT * all as f64
+/// How far the baselines of these pairs agree with a model: the share of their matches, each pair by its best
+/// geometry; `None` where they are too few.
+fn agreement<'p>(
+    pairs: impl Iterator<Item = &'p PairGeometry>,
+    components: &[Reconstruction],
+) -> Option<f64> {
+    let mut judged: BTreeMap<(ImageId, ImageId), (usize, bool)> = BTreeMap::new();
+    for pair in pairs.filter(|pair| pair.two_view.kind != TwoViewKind::PureRotation) {
+        let placed = components.iter().find_map(|component| {
+            let pose = |image: ImageId| component.images[image.index()].world_from_camera;
+            Some(pose(pair.second)?.inverse() * pose(pair.first)?)
+        });
+        let Some(placed) = placed else { continue };
+        let angle = placed.translation.angle(&pair.two_view.second_from_first.translation);
+        let (matches, agrees) = judged.entry((pair.first, pair.second)).or_default();
+        *matches = pair.two_view.inliers.len().max(*matches);
+        *agrees |= angle <= MAX_BASELINE_DEG.to_radians();
     }
+    let all: usize = judged.values().map(|(matches, _)| matches).sum();
+    let agreeing: usize = judged.values().filter(|(_, agrees)| *agrees).map(|(matches, _)| matches).sum();
+    (judged.len() >= MIN_JUDGING_PAIRS && all > 0).then(|| agreeing as f64 / all as f64)
 }
 
-/// Leaves the side underfoot out of all matches, where so many geometries explain nothing else that the place may
-/// repeat itself; `None` elsewhere.
-///
-/// On a floor of exactly repeated tiles each panorama matches the tiles under any other as if it stood a whole number of
-/// tiles away: all fall together within one tile, and agree on it. The walls around contradict, but are outvoted, and
-/// the floor's matches are not told from right ones one by one. So none of them counts, and pairs are verified again by
-/// what is left. Elsewhere one-sided pairs are few and outvoted themselves.
-pub(super) fn without_repeated_side(input: &MapperInput<'_>, seed: u64) -> Option<Remainder> {
-    let rays: Vec<Option<Rays>> = (input.images.par_iter().with_max_len(1))
-        .map(|image| {
-            let camera = &input.cameras[image.camera.index()];
-            let rays = (camera.is_panoramic() && image.mosaic.is_none()).then(|| image.features.rays(camera));
-            rays.filter(sees_all_around)
-        })
-        .collect();
-    let rays_of = |first: ImageId, second: ImageId| {
-        Some([rays[first.index()].as_ref()?, rays[second.index()].as_ref()?])
-    };
-    let matches: BTreeMap<(ImageId, ImageId), &[Match]> =
-        input.putative.iter().map(|pair| ((pair.first, pair.second), &pair.matches[..])).collect();
-    let is_one_sided: Vec<bool> = (input.pairs.par_iter().with_max_len(8))
-        .map(|pair| {
-            let all = matches.get(&(pair.first, pair.second)).copied().unwrap_or_default();
-            rays_of(pair.first, pair.second).is_some_and(|rays| is_one_sided(rays, pair, all))
-        })
-        .collect();
-    let one_sided =
-        || input.pairs.iter().zip(&is_one_sided).filter(|(_, is_one)| **is_one).map(|(pair, _)| pair);
-    let count: usize = one_sided().map(|pair| pair.two_view.inliers.len()).sum();
-    let all: usize = input.pairs.iter().map(|pair| pair.two_view.inliers.len()).sum();
-    if count as f64 <= MIN_REPEATED_SHARE * all as f64 {
-        return None;
-    }
-    // Where each image sees what repeats itself.
-    let mut poles = vec![Vector3::zeros(); rays.len()];
-    for pair in one_sided() {
-        for m in &pair.two_view.inliers {
-            for (image, feature) in [(pair.first, m.first), (pair.second, m.second)] {
-                if let Some(rays) = &rays[image.index()] {
-                    poles[image.index()] += rays.bearings[feature as usize];
+/// What the pairs of an input see underfoot only.
+pub(super) struct Underfoot<'a> {
+    input: &'a MapperInput<'a>,
+    /// Of panoramas that see all around.
+    rays: Vec<Option<Rays>>,
+    /// Whether each pair of the input explains what lies underfoot and nothing else.
+    is_one_sided: Vec<bool>,
+    /// Where each image sees that, of any length.
+    poles: Vec<Vector3<f64>>,
+}
+
+impl<'a> Underfoot<'a> {
+    /// `None` where no pair does.
+    pub fn find(input: &'a MapperInput<'a>) -> Option<Self> {
+        let rays: Vec<Option<Rays>> = (input.images.par_iter().with_max_len(1))
+            .map(|image| {
+                let camera = &input.cameras[image.camera.index()];
+                let is_plain = camera.is_panoramic() && image.mosaic.is_none();
+                is_plain.then(|| image.features.rays(camera)).filter(sees_all_around)
+            })
+            .collect();
+        let matches: BTreeMap<(ImageId, ImageId), &[Match]> =
+            input.putative.iter().map(|pair| ((pair.first, pair.second), &pair.matches[..])).collect();
+        let is_one_sided: Vec<bool> = (input.pairs.par_iter().with_max_len(8))
+            .map(|pair| {
+                let all = matches.get(&(pair.first, pair.second)).copied().unwrap_or_default();
+                both(&rays, pair.first, pair.second).is_some_and(|rays| is_one_sided(rays, pair, all))
+            })
+            .collect();
+        let mut poles = vec![Vector3::zeros(); rays.len()];
+        for (pair, _) in input.pairs.iter().zip(&is_one_sided).filter(|(_, is_one_sided)| **is_one_sided) {
+            for m in &pair.two_view.inliers {
+                for (image, feature) in [(pair.first, m.first), (pair.second, m.second)] {
+                    if let Some(rays) = &rays[image.index()] {
+                        poles[image.index()] += rays.bearings[feature as usize];
+                    }
                 }
             }
         }
+        is_one_sided.contains(&true).then_some(Self { input, rays, is_one_sided, poles })
     }
-    let is_repeated = |image: ImageId, feature: u32| {
-        let pole: &Vector3<f64> = &poles[image.index()];
-        let bearing = rays[image.index()].as_ref().map(|rays| rays.bearings[feature as usize]);
+
+    /// What the model ought to be made of in place of all, and what to say of it; `None` where nothing speaks against
+    /// it.
+    ///
+    /// On a floor of exactly repeated tiles each panorama matches the tiles under any other as if it stood a whole number
+    /// of tiles away: all fall together within one tile, and agree on it. The walls around contradict, but are
+    /// outvoted, and the floor's matches are not told from right ones one by one. Where the walls contradict the whole
+    /// model, none of the floor's matches counts. Where the model contradicts the floor's pairs, these count for nothing
+    /// with images that the floor alone holds. A floor that is right agrees with the walls.
+    pub fn better_input(&self, components: &[Reconstruction], seed: u64) -> Option<(Remainder, String)> {
+        if self.share() > MIN_REPEATED_SHARE {
+            let rest = self.left_out(|_| true, seed);
+            if agreement(rest.pairs.iter(), components).is_some_and(|share| share < MIN_AGREEMENT) {
+                return Some((rest, WARNING.to_owned()));
+            }
+        }
+        agreement(self.one_sided(), components).filter(|share| *share < MIN_AGREEMENT)?;
+        let held = self.held_underfoot(components);
+        if held.is_empty() {
+            return None;
+        }
+        let names: Vec<&str> = held.iter().map(|image| self.input.images[image.index()].name).collect();
+        let warning = format!(
+            "the floor repeats itself, and nothing else held {}: what lies underfoot was left out there",
+            names.join(", ")
+        );
+        Some((self.left_out(|image| held.contains(&image), seed), warning))
+    }
+
+    fn one_sided(&self) -> impl Iterator<Item = &PairGeometry> {
+        let numbered = self.input.pairs.iter().zip(&self.is_one_sided);
+        numbered.filter(|(_, is_one_sided)| **is_one_sided).map(|(pair, _)| pair)
+    }
+
+    /// Share of all verified matches that lie in one-sided geometries.
+    fn share(&self) -> f64 {
+        let all: usize = self.input.pairs.iter().map(|pair| pair.two_view.inliers.len()).sum();
+        let count: usize = self.one_sided().map(|pair| pair.two_view.inliers.len()).sum();
+        count as f64 / all.max(1) as f64
+    }
+
+    fn is_repeated(&self, image: ImageId, feature: u32) -> bool {
+        let pole: &Vector3<f64> = &self.poles[image.index()];
+        let bearing = self.rays[image.index()].as_ref().map(|rays| rays.bearings[feature as usize]);
         bearing.is_some_and(|bearing| bearing.dot(pole) > MAX_REPEATED_DEG.to_radians().cos() * pole.norm())
-    };
-    let verified: Vec<(PutativePair, Vec<PairGeometry>)> = (input
-        .putative
-        .par_iter()
-        .with_max_len(1)
-        .enumerate())
-    .map(|(at, pair)| {
-        let PutativePair { first, second, .. } = *pair;
-        let mut left = pair.clone();
-        left.matches.retain(|m| !is_repeated(first, m.first) && !is_repeated(second, m.second));
-        let geometries = match rays_of(first, second) {
-            Some([a, b]) => verify_pair(&input.two_view, a, b, &left.matches, seed.wrapping_add(at as u64)),
-            None => Vec::new(),
-        };
-        (left, geometries.into_iter().map(|two_view| PairGeometry { first, second, two_view }).collect())
-    })
-    .collect();
-    let (putative, pairs): (Vec<_>, Vec<Vec<_>>) = verified.into_iter().unzip();
-    Some(Remainder { putative, pairs: pairs.concat() })
+    }
+
+    /// Registered images of which next to no point lies away from what repeats itself.
+    fn held_underfoot(&self, components: &[Reconstruction]) -> Vec<ImageId> {
+        let mut held = Vec::new();
+        for component in components {
+            let mut counts = vec![[0_usize; 2]; component.images.len()];
+            for seen in component.points.iter().flat_map(|point| &point.track) {
+                counts[seen.image.index()][usize::from(self.is_repeated(seen.image, seen.feature))] += 1;
+            }
+            let is_held = |image: &ImageId| {
+                let [elsewhere, underfoot] = counts[image.index()];
+                underfoot > 0 && (elsewhere as f64) < MIN_ELSEWHERE * (elsewhere + underfoot) as f64
+            };
+            held.extend(component.registered().filter(is_held));
+        }
+        held
+    }
+
+    /// All matches and pairs, but in pairs with such images without what lies underfoot, and verified again.
+    fn left_out(&self, concerns: impl Fn(ImageId) -> bool + Sync, seed: u64) -> Remainder {
+        let is_concerned = |first: ImageId, second: ImageId| concerns(first) || concerns(second);
+        let verified: Vec<(PutativePair, Vec<PairGeometry>)> = (self.input.putative)
+            .par_iter()
+            .with_max_len(1)
+            .enumerate()
+            .filter(|(_, pair)| is_concerned(pair.first, pair.second))
+            .map(|(at, pair)| {
+                let PutativePair { first, second, .. } = *pair;
+                let mut left = pair.clone();
+                left.matches
+                    .retain(|m| !self.is_repeated(first, m.first) && !self.is_repeated(second, m.second));
+                let seed = seed.wrapping_add(at as u64);
+                let geometries = both(&self.rays, first, second)
+                    .map(|[a, b]| verify_pair(&self.input.two_view, a, b, &left.matches, seed));
+                let pair = |two_view| PairGeometry { first, second, two_view };
+                (left, geometries.into_iter().flatten().map(pair).collect())
+            })
+            .collect();
+        let (mut putative, pairs): (Vec<_>, Vec<Vec<_>>) = verified.into_iter().unzip();
+        let mut pairs = pairs.concat();
+        putative.extend(
+            self.input.putative.iter().filter(|pair| !is_concerned(pair.first, pair.second)).cloned(),
+        );
+        pairs.extend(self.input.pairs.iter().filter(|pair| !is_concerned(pair.first, pair.second)).cloned());
+        Remainder { putative, pairs }
+    }
+}
+
+fn both(rays: &[Option<Rays>], first: ImageId, second: ImageId) -> Option<[&Rays; 2]> {
+    Some([rays[first.index()].as_ref()?, rays[second.index()].as_ref()?])
 }
 
 /// Whether a geometry explains what lies underfoot, and next to nothing else.
