@@ -1,6 +1,8 @@
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
+use crate::GeoPosition;
+
 /// Semi-major axis of WGS84 in metres.
 const A: f64 = 6_378_137.0;
 /// First eccentricity squared of WGS84.
@@ -57,6 +59,18 @@ impl Wgs84 {
     /// Whether the numbers can be a place on earth.
     pub fn is_valid(self) -> bool {
         self.lat.abs() <= 90.0 && self.lon.abs() <= 360.0 && self.alt.is_finite()
+    }
+}
+
+impl GeoPosition {
+    /// The place, at a given altitude where none is known.
+    pub fn or_at(&self, alt: f64) -> Wgs84 {
+        Wgs84 { lat: self.lat_deg, lon: self.lon_deg, alt: self.alt_m.unwrap_or(alt) }
+    }
+
+    /// Whether the numbers can be a place on earth.
+    pub fn is_valid(&self) -> bool {
+        self.or_at(0.0).is_valid()
     }
 }
 

@@ -2,7 +2,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use setloc_features::Wgs84;
+use setloc_features::GeoPosition;
 
 use super::find_by_name;
 use crate::error::Hinted;
@@ -21,7 +21,7 @@ pub enum GeoSource {
 /// Measured positions by image.
 #[derive(Debug, Clone, Default)]
 pub struct GeoBook {
-    by_image: BTreeMap<String, Wgs84>,
+    by_image: BTreeMap<String, GeoPosition>,
 }
 
 /// Where in a line the fields are, counted from 0.
@@ -51,14 +51,14 @@ impl Columns {
     }
 
     /// The image and its position in a line.
-    fn read(self, fields: &[&str]) -> Option<(String, Wgs84)> {
+    fn read(self, fields: &[&str]) -> Option<(String, GeoPosition)> {
         let field = |at: usize| fields.get(at).copied().unwrap_or_default();
         let number = |at: usize| field(at).parse::<f64>().ok();
-        let alt = match self.alt {
-            Some(at) if !field(at).is_empty() => number(at)?,
-            _ => 0.0,
+        let alt_m = match self.alt {
+            Some(at) if !field(at).is_empty() => Some(number(at)?),
+            _ => None,
         };
-        let place = Wgs84 { lat: number(self.lat)?, lon: number(self.lon)?, alt };
+        let place = GeoPosition { lat_deg: number(self.lat)?, lon_deg: number(self.lon)?, alt_m };
         let name = field(self.name);
         (place.is_valid() && !name.is_empty()).then(|| (name.to_owned(), place))
     }
@@ -102,7 +102,7 @@ impl GeoBook {
     }
 
     /// The position of an image, if the table names it.
-    pub fn find(&self, name: &str, path: &Path) -> Option<Wgs84> {
+    pub fn find(&self, name: &str, path: &Path) -> Option<GeoPosition> {
         find_by_name(&self.by_image, name, path).copied()
     }
 
@@ -123,26 +123,26 @@ mod tests {
         GeoBook::read(&path)
     }
 
-    fn place(book: &GeoBook, name: &str) -> [f64; 3] {
+    fn place(book: &GeoBook, name: &str) -> (f64, f64, Option<f64>) {
         let place = book.find(name, Path::new(name)).unwrap();
-        [place.lat, place.lon, place.alt]
+        (place.lat_deg, place.lon_deg, place.alt_m)
     }
 
     #[test]
     fn columns_are_read_by_the_names_of_the_header() {
         let book = read("\u{feff}Name, lon, lat, alt\r\np/a.png,8.5,47.25,400\r\n\r\np/b.png,8.5,47.5,\r\n")
             .unwrap();
-        assert_eq!(place(&book, "p/a.png"), [47.25, 8.5, 400.0]);
-        assert_eq!(place(&book, "p/b.png"), [47.5, 8.5, 0.0]);
+        assert_eq!(place(&book, "p/a.png"), (47.25, 8.5, Some(400.0)));
+        assert_eq!(place(&book, "p/b.png"), (47.5, 8.5, None));
         let book = read("lat,lon,name\n47.25,8.5,a.png\n").unwrap();
-        assert_eq!(place(&book, "a.png"), [47.25, 8.5, 0.0]);
+        assert_eq!(place(&book, "a.png"), (47.25, 8.5, None));
     }
 
     #[test]
     fn a_table_without_a_header_is_read_from_its_first_line() {
         let book = read("a.png,47.25,8.5,400\nb.png,47.5,8.5\n").unwrap();
-        assert_eq!(place(&book, "a.png"), [47.25, 8.5, 400.0]);
-        assert_eq!(place(&book, "b.png"), [47.5, 8.5, 0.0]);
+        assert_eq!(place(&book, "a.png"), (47.25, 8.5, Some(400.0)));
+        assert_eq!(place(&book, "b.png"), (47.5, 8.5, None));
     }
 
     #[test]

@@ -3,7 +3,7 @@ use std::path::{Component, Path, PathBuf};
 
 use anyhow::{Context, Result};
 use rayon::prelude::*;
-use setloc_features::{Camera, CameraSource, Wgs84};
+use setloc_features::{Camera, CameraSource, GeoPosition};
 
 use super::remarks::{Given, warnings_of};
 use super::{CameraBook, GeoBook, GeoSource};
@@ -30,7 +30,7 @@ pub struct SourceImage {
     /// Where the camera comes from.
     pub camera_origin: CameraOrigin,
     /// Measured position.
-    pub position: Option<Wgs84>,
+    pub position: Option<GeoPosition>,
     /// Mask image.
     pub mask: Option<(PathBuf, ContentHash)>,
 }
@@ -232,9 +232,7 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
         (camera, fixed, CameraOrigin::Guessed(source))
     };
     let exif = (*geo == GeoSource::Exif).then_some(info.metadata.gps).flatten();
-    let position =
-        exif.map(|gps| Wgs84 { lat: gps.lat_deg, lon: gps.lon_deg, alt: gps.alt_m.unwrap_or(0.0) });
-    let position = position.filter(|place| place.is_valid());
+    let position = exif.filter(GeoPosition::is_valid);
     let hash = ContentHash::of(&bytes);
     Ok(SourceImage {
         name: name.to_owned(),
@@ -311,7 +309,7 @@ mod tests {
         let book = CameraBook::read(&cameras).unwrap();
         let read =
             ImageFolder::read(&list_images(&days).unwrap(), &book, &GeoSource::Table(table), None).unwrap();
-        let latitudes: Vec<f64> = read.images.iter().map(|image| image.position.unwrap().lat).collect();
+        let latitudes: Vec<f64> = read.images.iter().map(|image| image.position.unwrap().lat_deg).collect();
         assert_eq!(latitudes, [1.0, 2.0, 3.0]);
         assert!(read.images.iter().all(|image| image.camera == camera && image.camera_fixed));
         assert!(read.warnings.is_empty(), "{:?}", read.warnings);

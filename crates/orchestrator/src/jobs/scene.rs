@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use anyhow::Result;
 use rayon::prelude::*;
 use serde_json::json;
-use setloc_features::{ImageFeatures, Wgs84};
+use setloc_features::{GeoPosition, ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
 use setloc_sfm::{MapperOutput, MeasuredPosition, MergeRecord, Reconstruction, ReconstructionImage};
 
@@ -40,7 +40,9 @@ pub fn add_scene(
 ) -> Result<SceneJobs> {
     let origin = origin_of(images);
     let position = |image: &SourceImage| {
-        Some(MeasuredPosition { enu: image.position?.to_enu(origin?), has_height: true })
+        let (place, origin) = (image.position?, origin?);
+        let enu = place.or_at(origin.alt).to_enu(origin);
+        Some(MeasuredPosition { enu, has_height: place.alt_m.is_some() })
     };
     let listed: Vec<Option<MeasuredPosition>> = images.iter().map(position).collect();
     let (order, pairs) = by_content(images, &choose_pairs(&config.pairs, &listed));
@@ -195,16 +197,20 @@ fn named(model: &Reconstruction, names: &[String]) -> Reconstruction {
 
 /// The middle of the measured positions, coordinate by coordinate: a wrong one hardly moves it.
 fn origin_of(images: &[SourceImage]) -> Option<Wgs84> {
-    let places: Vec<Wgs84> = images.iter().filter_map(|image| image.position).collect();
-    let first = places.first()?.lon;
+    let places: Vec<GeoPosition> = images.iter().filter_map(|image| image.position).collect();
+    let first = places.first()?.lon_deg;
     // About the first, across the date line too.
-    let from_first = |place: &Wgs84| (place.lon - first + 180.0).rem_euclid(360.0) - 180.0;
-    let lon = middle(places.iter().map(from_first))? + first;
+    let from_first = |place: &GeoPosition| about_zero(place.lon_deg - first);
     Some(Wgs84 {
-        lat: middle(places.iter().map(|place| place.lat))?,
-        lon: (lon + 180.0).rem_euclid(360.0) - 180.0,
-        alt: middle(places.iter().map(|place| place.alt))?,
+        lat: middle(places.iter().map(|place| place.lat_deg))?,
+        lon: about_zero(middle(places.iter().map(from_first))? + first),
+        alt: middle(places.iter().filter_map(|place| place.alt_m)).unwrap_or(0.0),
     })
+}
+
+/// The same angle within 180 degrees of zero.
+fn about_zero(degrees: f64) -> f64 {
+    (degrees + 180.0).rem_euclid(360.0) - 180.0
 }
 
 /// The lower median.
@@ -212,4 +218,39 @@ fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
     let mut values: Vec<f64> = values.collect();
     let at = values.len().checked_sub(1)? / 2;
     Some(*values.select_nth_unstable_by(at, f64::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use setloc_features::Camera;
+
+    use super::*;
+    use crate::dataset::CameraOrigin;
+
+    #[test]
+    fn a_wrong_position_hardly_moves_the_origin_nor_does_the_date_line() {
+        let image = |(lat_deg, lon_deg, alt_m): (f64, f64, Option<f64>)| SourceImage {
+            name: String::new(),
+            path: PathBuf::new(),
+            hash: ContentHash::of(b""),
+            camera: Camera::equirectangular(20, 10),
+            camera_fixed: true,
+            camera_origin: CameraOrigin::Listed,
+            position: Some(GeoPosition { lat_deg, lon_deg, alt_m }),
+            mask: None,
+        };
+        let places = [
+            (-17.0, 179.999, Some(12.0)),
+            (-17.001, -179.999, None),
+            (0.0, 0.0, Some(0.0)),
+            (-17.002, 179.9995, Some(13.0)),
+            (-17.001, 180.0005, None),
+        ];
+        let origin = origin_of(&places.map(image)).unwrap();
+        assert!((origin.lat + 17.001).abs() < 1e-9 && origin.alt == 12.0, "{origin:?}");
+        assert!(about_zero(origin.lon - 180.0).abs() < 0.0011, "{origin:?}");
+        assert_eq!(origin_of(&[]), None);
+    }
 }
