@@ -105,6 +105,11 @@ impl Artifact for PairMatches {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct VerifiedPair(pub Vec<TwoView>);
 
+/// For each image others that look alike, most first; empty for images that nobody asked about.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct LikelyImages(pub Vec<Vec<u32>>);
+
+serde_artifact!(LikelyImages, "likely images", 1);
 serde_artifact!(VerifiedPair, "verified pair", 1);
 serde_artifact!(MapperOutput, "model", 5);
 serde_artifact!(SceneIndex, "index", 1);

@@ -7,14 +7,16 @@ use anyhow::Result;
 use rayon::prelude::*;
 use setloc_features::ImageFeatures;
 
+use crate::artifacts::LikelyImages;
 use crate::config::Config;
-use crate::dataset::{ImageFolder, SkippedImage};
+use crate::dataset::{ImageFolder, SkippedImage, SourceImage};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Executor, JobGraph, RunResult};
-use crate::jobs::{SceneJobs, add_scene};
+use crate::jobs::{LikelyJobs, SceneJobs, add_scene};
 use crate::scene::SceneFile;
 use crate::session::Session;
+use crate::stages::FeatureParams;
 
 /// A scene that was built, or found built.
 pub struct Built {
@@ -55,12 +57,14 @@ pub fn build_scene(
     present: Option<ContentHash>,
     export: impl FnOnce(&Built) -> Result<()>,
 ) -> Result<BuildOutcome> {
+    let (alike, before) = alike_pairs(session, name, &folder.images, &config.features, config)?;
     let mut graph = JobGraph::default();
-    let jobs = add_scene(&mut graph, &folder.images, config, seed)?;
+    let jobs = add_scene(&mut graph, &folder.images, &alike, config, seed)?;
     graph.want(jobs.scene);
     graph.want_file(jobs.scene);
     jobs.features.iter().for_each(|features| graph.want(*features));
     let use_results = |executor: &Executor<'_>, run: &RunResult| {
+        let run = &before.clone().and(run.clone());
         let outcome = outcome_of(executor, &graph, &jobs, folder, run, present)?;
         if let BuildOutcome::Built(built) = &outcome {
             export(built)?;
@@ -68,8 +72,30 @@ pub fn build_scene(
         Ok(outcome)
     };
     let (run, outcome) = session.run_with(name, &graph, use_results)?;
-    session.remember(name, &run)?;
+    session.remember(name, &before.and(run))?;
     outcome
+}
+
+/// Pairs of images that look alike, where pairs cannot be chosen without, and what finding them took.
+///
+/// # Errors
+/// When the run was stopped or the store cannot be written.
+pub fn alike_pairs(
+    session: &Session,
+    name: &str,
+    images: &[SourceImage],
+    features: &FeatureParams,
+    config: &Config,
+) -> Result<(Vec<(usize, usize)>, RunResult)> {
+    let mut graph = JobGraph::default();
+    let Some(jobs) = LikelyJobs::add(&mut graph, "all", images, features, config)? else {
+        return Ok((Vec::new(), RunResult::default()));
+    };
+    session.run(name, &graph, |executor, run| {
+        let found =
+            executor.output(jobs.likely).map(|_| executor.load::<LikelyImages>(jobs.likely)).transpose()?;
+        Ok((found.map(|found| jobs.pairs(&found)).unwrap_or_default(), run.clone()))
+    })
 }
 
 /// What the jobs came to; the scene is read unless it is `present`.

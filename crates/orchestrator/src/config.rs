@@ -70,11 +70,13 @@ pub struct PairParams {
     pub window: usize,
     /// Above that, each image is also matched with this many nearest ones by measured position.
     pub nearest: usize,
+    /// Above that, each image without a measured position is also matched with this many that look most alike.
+    pub alike: usize,
 }
 
 impl Default for PairParams {
     fn default() -> Self {
-        Self { exhaustive_up_to: 60, window: 8, nearest: 16 }
+        Self { exhaustive_up_to: 60, window: 8, nearest: 16, alike: 16 }
     }
 }
 

@@ -1,11 +1,13 @@
 //! The job kinds and how they depend on each other.
 
 mod alignment;
+mod likely;
 mod locate;
 mod model;
 mod pairs;
 mod scene;
 
+pub use likely::LikelyJobs;
 pub use locate::{LocateJobs, SetJobs, add_set, add_singles};
 pub use model::{ModelJobs, ModelKind, add_features_of, add_model};
 pub use pairs::choose_pairs;

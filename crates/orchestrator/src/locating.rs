@@ -6,6 +6,7 @@ use anyhow::Result;
 use setloc_camset::{PhotoLocalization, SetLocalization, SingleLocalization, Verdict};
 use setloc_sfm::MapperOutput;
 
+use crate::building::alike_pairs;
 use crate::dataset::{ImageFolder, SkippedImage};
 use crate::graph::{JobGraph, JobId, RunResult};
 use crate::jobs::{LocateJobs, add_features_of, add_set, add_singles};
@@ -105,8 +106,13 @@ fn run(
     (alone, as_set): (bool, bool),
     located: &mut Located,
 ) -> Result<RunResult> {
+    let (alike, before) = if as_set {
+        alike_pairs(session, name, &folder.images, &what.config.photo_features(), &what.config)?
+    } else {
+        (Vec::new(), RunResult::default())
+    };
     let mut graph = JobGraph::default();
-    let set = as_set.then(|| add_set(&mut graph, target, &folder.images, what)).transpose()?;
+    let set = as_set.then(|| add_set(&mut graph, target, &folder.images, &alike, what)).transpose()?;
     let features = match &set {
         Some(set) => set.model.features.clone(),
         None => add_features_of(&mut graph, &folder.images, &what.config.photo_features()),
@@ -132,7 +138,7 @@ fn run(
             let model = executor.load::<MapperOutput>(set.model.model)?;
             located.local_models = model.components.iter().map(|c| c.registered().count()).collect();
         }
-        Ok(result.clone())
+        Ok(before.and(result.clone()))
     })
 }
 

@@ -14,6 +14,8 @@ pub use setloc_features::{
 pub const FEATURES_VERSION: u32 = FeatureParams::VERSION;
 /// Version of matching.
 pub const MATCHING_VERSION: u32 = MatchParams::VERSION;
+/// Version of the comparison of all images by their strongest keypoints.
+pub const LIKELY_VERSION: u32 = 1;
 /// Version of two-view verification.
 pub const VERIFY_VERSION: u32 = setloc_sfm::TWO_VIEW_VERSION;
 /// Version of mapping.

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use setloc_orchestrator::building::{BuildOutcome, Built, build_scene};
-use setloc_orchestrator::config::Config;
+use setloc_orchestrator::config::{Config, PairParams};
 use setloc_orchestrator::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use setloc_orchestrator::jobs::LocateJobs;
 use setloc_orchestrator::locating::{Mode, locate};
@@ -56,6 +56,31 @@ fn a_changed_parameter_runs_only_what_depends_on_it() {
     assert_eq!(ran(&built, "verify").len(), 3);
     // The scene file names its configuration; nothing else may follow from verifications that came out the same.
     assert_eq!(ran(&built, "scene").len(), 1);
+}
+
+#[test]
+fn images_that_look_alike_are_matched_whatever_they_are_called() {
+    let folder = tempfile::tempdir().unwrap();
+    let (images, store) = (panoramas(folder.path(), 4), folder.path().join("store"));
+    let pairs = PairParams { exhaustive_up_to: 2, window: 0, nearest: 0, alike: 3 };
+    let mut config = Config { pairs, ..Config::default() };
+    let first = build(&store, &images, &config);
+    assert_eq!((ran(&first, "features").len(), ran(&first, "likely").len()), (4, 1), "{:?}", first.run.ran);
+    assert_eq!((ran(&first, "matches").len(), first.run.hits), (6, 0), "{:?}", first.run.ran);
+    assert!(build(&store, &images, &config).run.ran.is_empty());
+    // The other way round, by name.
+    let mut names: Vec<_> = std::fs::read_dir(&images).unwrap().map(|entry| entry.unwrap().path()).collect();
+    names.sort();
+    for (at, path) in names.iter().enumerate() {
+        let ending = path.extension().unwrap().to_str().unwrap();
+        std::fs::rename(path, images.join(format!("z{}.{ending}", 9 - at))).unwrap();
+    }
+    let renamed = build(&store, &images, &config);
+    let kinds: BTreeSet<&str> = renamed.run.ran.iter().filter_map(|label| label.split(' ').next()).collect();
+    assert_eq!(kinds, BTreeSet::from(["scene"]), "{:?}", renamed.run.ran);
+    config.pairs.alike = 0;
+    let without = build(&store, &images, &config);
+    assert!(ran(&without, "matches").is_empty() && without.scene.main().is_none());
 }
 
 /// Builds the town's scene and locates its set in it; the labels of the jobs that ran.

@@ -8,17 +8,18 @@ use setloc_sfm::Reconstruction;
 
 use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
-use crate::building::{BuildOutcome, Built, build_scene};
+use crate::building::{BuildOutcome, Built, alike_pairs, build_scene};
+use crate::config::Config;
 use crate::dataset::{ImageFolder, SkippedImage, list_images};
 use crate::error::Hinted;
 use crate::export::{Marker, colmap_lacks, ply, scene_json, top_view_png, write_colmap};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, Prediction};
-use crate::jobs::add_scene;
+use crate::jobs::{LikelyJobs, add_scene};
 use crate::print;
 use crate::scene::SceneFile;
 use crate::session::{Session, cache_folder};
-use crate::store::{Store, write_atomically};
+use crate::store::{RunRecord, Store, write_atomically};
 
 /// Blue, for cameras of the scene.
 pub const SCENE_COLOR: [u8; 3] = [30, 90, 220];
@@ -75,14 +76,16 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
 pub fn plan(args: &PlanArgs) -> Result<Answer> {
     let config = args.source.run.config()?;
     let folder = read_sources(&args.source)?;
+    let store = Store::at(&cache_folder(args.source.run.cache.as_deref(), &args.source.output));
+    let name = store.name_of("build", &args.source.output);
+    let alike = stored_alike_pairs(args, &folder, &config, (&store, &name))?;
     let mut graph = JobGraph::default();
-    add_scene(&mut graph, &folder.images, &config, args.source.run.seed)?;
+    add_scene(&mut graph, &folder.images, &alike, &config, args.source.run.seed)?;
     if args.format == PlanFormat::Dot {
         print::data(graph.to_dot().trim_end());
         return Ok(Answer::Done);
     }
-    let store = Store::at(&cache_folder(args.source.run.cache.as_deref(), &args.source.output));
-    let planned = graph.plan(&store, &store.run(&store.name_of("build", &args.source.output)));
+    let planned = graph.plan(&store, &store.run(&name));
     if args.format == PlanFormat::Json {
         print::data(&serde_json::to_string_pretty(&planned)?);
         return Ok(Answer::Done);
@@ -100,6 +103,28 @@ pub fn plan(args: &PlanArgs) -> Result<Answer> {
         (count(Prediction::Runs), count(Prediction::Follows), count(Prediction::Stored));
     print::data(&format!("{runs} jobs run, {follows} depend on them, {stored} are stored"));
     Ok(Answer::Done)
+}
+
+/// Pairs of images that look alike, as far as that is known: a plan runs nothing.
+fn stored_alike_pairs(
+    args: &PlanArgs,
+    folder: &ImageFolder,
+    config: &Config,
+    (store, name): (&Store, &str),
+) -> Result<Vec<(usize, usize)>> {
+    let mut graph = JobGraph::default();
+    if LikelyJobs::add(&mut graph, "all", &folder.images, &config.features, config)?.is_none() {
+        return Ok(Vec::new());
+    }
+    let planned = graph.plan(store, &RunRecord::default());
+    if planned.iter().any(|job| job.prediction != Prediction::Stored) {
+        print::note(
+            "pairs of images that look alike are chosen once their features are known, and not listed",
+        );
+        return Ok(Vec::new());
+    }
+    let session = args.source.run.session(&args.source.output, None)?;
+    Ok(alike_pairs(&session, name, &folder.images, &config.features, config)?.0)
 }
 
 /// The scene whose exports are in a folder.

@@ -65,6 +65,7 @@ const RANGES: &[(&str, Range)] = &[
     ("pairs.exhaustive_up_to", Range::NotNegative),
     ("pairs.window", Range::NotNegative),
     ("pairs.nearest", Range::NotNegative),
+    ("pairs.alike", Range::NotNegative),
     ("matching.max_distance", Range::Within(1e-6, std::f64::consts::SQRT_2 + 1e-9)),
     ("matching.screen_features", Range::NotNegative),
     ("matching.screen_matches", Range::NotNegative),

@@ -60,12 +60,22 @@ pub struct RunResult {
 }
 
 impl RunResult {
+    /// With what a further graph of the same command came to.
+    #[must_use]
+    pub fn and(mut self, other: Self) -> Self {
+        self.absorb(other);
+        self
+    }
+
     /// Adds what a further graph of the same command came to.
     pub fn absorb(&mut self, other: Self) {
+        // What this command made or found before is found again.
+        let is_hit = |label: &&String| other.ran.binary_search(label).is_err();
+        let again = other.keys.keys().filter(is_hit).filter(|label| self.keys.contains_key(*label)).count();
+        self.hits += other.hits.saturating_sub(again);
         self.ran.extend(other.ran);
         self.ran.sort();
         self.ran.dedup();
-        self.hits += other.hits;
         self.failed.extend(other.failed);
         self.keys.extend(other.keys);
     }

@@ -41,7 +41,7 @@ pub struct SetJobs {
 }
 
 /// Adds features, matches, local model, localization of each photo alone and of the set; `name` is what its jobs are
-/// called.
+/// called, and `alike` are pairs of photos that look alike.
 ///
 /// # Errors
 /// When parameters have no JSON form.
@@ -49,10 +49,11 @@ pub fn add_set(
     graph: &mut JobGraph<'_>,
     name: &str,
     photos: &[SourceImage],
+    alike: &[(usize, usize)],
     what: &LocateJobs,
 ) -> Result<SetJobs> {
     let positions = vec![None; photos.len()];
-    let pairs = choose_pairs(&what.config.pairs, &positions);
+    let pairs = choose_pairs(&what.config.pairs, &positions, alike);
     let source = ModelSource { images: photos, positions: &positions, pairs: &pairs };
     let model = add_model(graph, ModelKind::Local, name, source, &what.config, what.seed)?;
     let single = add_singles(graph, photos, &model.features, what);

@@ -28,13 +28,14 @@ pub struct SceneJobs {
     pub scene: JobId,
 }
 
-/// Adds all jobs from image files to a scene file.
+/// Adds all jobs from image files to a scene file; `alike` are pairs of images that look alike.
 ///
 /// # Errors
 /// When parameters have no JSON form.
 pub fn add_scene(
     graph: &mut JobGraph<'_>,
     images: &[SourceImage],
+    alike: &[(usize, usize)],
     config: &Config,
     seed: u64,
 ) -> Result<SceneJobs> {
@@ -45,7 +46,7 @@ pub fn add_scene(
         Some(MeasuredPosition { enu, has_height: place.alt_m.is_some() })
     };
     let listed: Vec<Option<MeasuredPosition>> = images.iter().map(position).collect();
-    let (order, pairs) = by_content(images, &choose_pairs(&config.pairs, &listed));
+    let (order, pairs) = by_content(images, &choose_pairs(&config.pairs, &listed, alike));
     let images: Vec<SourceImage> = order.iter().map(|&at| images[at].clone()).collect();
     let positions: Vec<Option<MeasuredPosition>> = order.iter().map(|&at| listed[at]).collect();
     let source = ModelSource { images: &images, positions: &positions, pairs: &pairs };

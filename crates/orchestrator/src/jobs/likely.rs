@@ -1,0 +1,198 @@
+//! Which images look alike: pairs for large unordered sets whose places nobody measured.
+
+use std::collections::BTreeMap;
+
+use anyhow::Result;
+use rayon::prelude::*;
+use serde_json::json;
+use setloc_features::ImageFeatures;
+
+use super::model::{add_features_of, features_role};
+use crate::artifacts::LikelyImages;
+use crate::config::Config;
+use crate::dataset::SourceImage;
+use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
+use crate::stages::{self, MatchParams};
+
+/// Keypoints by which images are compared, of the bright and of the dark. With half as many, 63 of 198 third neighbours of a
+/// rendered street were not among the 16 most alike in place of 30; with twice as many 14, at four times the work.
+const STRONGEST: usize = 512;
+
+/// Of how many most alike images the most alike are taken, too: the next on either side.
+const NEAREST: usize = 3;
+
+/// The jobs that tell which images look alike.
+#[derive(Debug, Clone)]
+pub struct LikelyJobs {
+    /// The images in the order of their content, as places in the list given.
+    order: Vec<usize>,
+    /// The job whose result they are.
+    pub likely: JobId,
+}
+
+impl LikelyJobs {
+    /// Adds extraction and comparison; `None` where pairs are chosen without.
+    ///
+    /// Up to [`PairParams::exhaustive_up_to`](crate::config::PairParams) images all are matched, and those with a measured
+    /// position with their neighbours.
+    ///
+    /// # Errors
+    /// When parameters have no JSON form.
+    pub fn add(
+        graph: &mut JobGraph<'_>,
+        name: &str,
+        images: &[SourceImage],
+        features: &stages::FeatureParams,
+        config: &Config,
+    ) -> Result<Option<Self>> {
+        let is_wanted = |image: &SourceImage| image.position.is_none();
+        let most = config.pairs.alike;
+        if images.len() <= config.pairs.exhaustive_up_to || most == 0 || !images.iter().any(is_wanted) {
+            return Ok(None);
+        }
+        // Whatever an image is called, the result is the same.
+        let mut order: Vec<usize> = (0..images.len()).collect();
+        order.sort_by_key(|&at| (images[at].hash, at));
+        let ordered: Vec<SourceImage> = order.iter().map(|&at| images[at].clone()).collect();
+        let wanted: Vec<bool> = ordered.iter().map(is_wanted).collect();
+        let features = add_features_of(graph, &ordered, features);
+        let matching = config.matching.clone();
+        let params = json!({ "matching": matching, "strongest": STRONGEST, "alike": most, "wanted": wanted });
+        let work = move |inputs: &Inputs<'_, '_>| {
+            let strongest = (0..wanted.len()).into_par_iter().with_max_len(1).map(|at| {
+                let features = inputs.find::<ImageFeatures>(&features_role(at))?;
+                Ok(features.map(|features| features.strongest(STRONGEST)).unwrap_or_default())
+            });
+            let strongest: Vec<ImageFeatures> = strongest.collect::<Result<_>>()?;
+            Product::new(LikelyImages(most_alike(&matching, &strongest, &wanted, most)))
+        };
+        let likely = graph.add(Job {
+            kind: "likely",
+            version: stages::LIKELY_VERSION,
+            name: name.to_owned(),
+            params,
+            external: BTreeMap::new(),
+            memory: images.len() as u64 * (STRONGEST as u64 * 2 * 160),
+            work: Box::new(work),
+        });
+        for (at, &features) in features.iter().enumerate() {
+            graph.accept(likely, features_role(at), features);
+        }
+        graph.want(likely);
+        Ok(Some(Self { order, likely }))
+    }
+
+    /// The pairs, as places in the list of images: of images that look alike, and of those that look most like the
+    /// same third.
+    ///
+    /// The next but one often looks less alike than what merely repeats itself (14 of 198 on a rendered street), and
+    /// without it nothing tells one step's length from the next.
+    pub fn pairs(&self, found: &LikelyImages) -> Vec<(usize, usize)> {
+        let place = |at: u32| self.order.get(at as usize).copied();
+        let first =
+            |at: u32| found.0.get(at as usize).map_or(&[][..], |others| &others[..others.len().min(NEAREST)]);
+        let of_one = |(at, others): (usize, &Vec<u32>)| {
+            let beyond = first(at as u32).iter().flat_map(|&next| first(next));
+            let pair = |other: &u32| Some((place(at as u32)?, place(*other)?));
+            let pairs = others.iter().chain(beyond).filter_map(pair).filter(|(a, b)| a != b);
+            pairs.map(|(a, b)| (a.min(b), a.max(b))).collect::<Vec<_>>()
+        };
+        let mut pairs: Vec<(usize, usize)> = found.0.iter().enumerate().flat_map(of_one).collect();
+        pairs.sort_unstable();
+        pairs.dedup();
+        pairs
+    }
+}
+
+/// For each wanted image so many others that share most matches with it, most first.
+fn most_alike(
+    matching: &MatchParams,
+    images: &[ImageFeatures],
+    wanted: &[bool],
+    most: usize,
+) -> Vec<Vec<u32>> {
+    let matching = MatchParams { screen_features: 0, ..matching.clone() };
+    let count = images.len();
+    // Each pair once.
+    let rows: Vec<Vec<u32>> = (0..count)
+        .into_par_iter()
+        .with_max_len(1)
+        .map(|a| {
+            let shared = |b: usize| {
+                let is_asked = wanted[a] || wanted[b];
+                if is_asked {
+                    stages::match_features(&matching, &images[a], &images[b]).len() as u32
+                } else {
+                    0
+                }
+            };
+            (a + 1..count).map(shared).collect()
+        })
+        .collect();
+    let shared = |a: usize, b: usize| rows[a.min(b)][a.max(b) - a.min(b) - 1];
+    let likely = |a: usize| {
+        let mut others: Vec<u32> = (0..count as u32).filter(|&b| b as usize != a).collect();
+        others.retain(|&b| shared(a, b as usize) > 0);
+        others.sort_by_key(|&b| (std::cmp::Reverse(shared(a, b as usize)), b));
+        others.truncate(most);
+        others
+    };
+    (0..count).map(|a| if wanted[a] { likely(a) } else { Vec::new() }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use setloc_features::{DESCRIPTOR_LEN, Keypoint};
+
+    use super::*;
+
+    /// Images along a street: each shares half of its keypoints with the next.
+    fn street(count: usize) -> Vec<ImageFeatures> {
+        let mut state = 1_u64;
+        let mut value = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 33) as u8 % 90
+        };
+        let blocks: Vec<Vec<u8>> =
+            (0..=count).map(|_| (0..40 * DESCRIPTOR_LEN).map(|_| value()).collect()).collect();
+        let image = |pair: &[Vec<u8>]| ImageFeatures {
+            width: 100,
+            height: 50,
+            keypoints: vec![Keypoint { x: 1.0, y: 1.0, size: 3.0, orientation: 0.0, noise_px: 0.1 }; 80],
+            descriptors: pair.concat(),
+            colors: vec![[0; 3]; 80],
+            ..ImageFeatures::default()
+        };
+        blocks.windows(2).map(image).collect()
+    }
+
+    #[test]
+    fn neighbours_look_most_alike_and_only_who_asks_gets_an_answer() {
+        let images = street(6);
+        let found = most_alike(&MatchParams::default(), &images, &[true; 6], 2);
+        assert_eq!(found, [vec![1], vec![0, 2], vec![1, 3], vec![2, 4], vec![3, 5], vec![4]]);
+        let one = most_alike(&MatchParams::default(), &images, &[false, false, true, false, false, false], 1);
+        assert_eq!(one, [vec![], vec![], vec![1], vec![], vec![], vec![]]);
+    }
+
+    #[test]
+    fn pairs_are_of_the_images_as_given() {
+        let mut graph = JobGraph::default();
+        let config = Config::default();
+        let none = LikelyJobs::add(&mut graph, "few", &[], &config.features, &config).unwrap();
+        assert!(none.is_none() && graph.is_empty());
+        let likely = graph.add(Job {
+            kind: "likely",
+            version: 1,
+            name: String::new(),
+            params: json!(null),
+            external: BTreeMap::new(),
+            memory: 0,
+            work: Box::new(|_| Product::new(LikelyImages::default())),
+        });
+        let jobs = LikelyJobs { order: vec![2, 0, 1], likely };
+        let found = LikelyImages(vec![vec![1], vec![0, 2], vec![9]]);
+        // The first two look alike, the last two; and the first and last both look like the second.
+        assert_eq!(jobs.pairs(&found), [(0, 1), (0, 2), (1, 2)]);
+    }
+}
