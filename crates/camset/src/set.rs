@@ -365,6 +365,10 @@ mod tests {
 
     /// A set whose scene has no point that any of its photos shows.
     fn locate_by_views(panoramas: &[u32], seed: u64) -> (World, SetLocalization) {
+        locate_by_views_with(&CamsetParams::default(), panoramas, seed)
+    }
+
+    fn locate_by_views_with(params: &CamsetParams, panoramas: &[u32], seed: u64) -> (World, SetLocalization) {
         let mut world = World::chain(6, 0.2, seed);
         world.forget_seen_points();
         let alone = |photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7);
@@ -372,8 +376,17 @@ mod tests {
         let models = std::slice::from_ref(&world.local);
         let photos = (&*world.queries(), &*alone);
         let views = || world.views(panoramas);
-        let found = locate_with(&CamsetParams::default(), &world.scene(), photos, models, views, 7);
+        let found = locate_with(params, &world.scene(), photos, models, views, 7);
         (world, found)
+    }
+
+    #[test]
+    fn without_other_hypotheses_only_the_solver_places_a_set() {
+        // It goes by scene points, of which this set sees none.
+        let params = CamsetParams { other_hypotheses: false, ..CamsetParams::default() };
+        let (_, found) = locate_by_views_with(&params, &[5, 7], 1);
+        assert!(found.world_from_set.is_empty());
+        assert!(!locate_by_views(&[5, 7], 1).1.world_from_set.is_empty());
     }
 
     #[test]
