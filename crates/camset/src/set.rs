@@ -306,7 +306,7 @@ mod tests {
 
     use super::*;
     use crate::jackknife::deviation;
-    use crate::test_scene::{Place, World, along_street};
+    use crate::synthetic::{Place, World, along_street};
     use crate::{CamsetMethod, PathToScene, SingleParams, locate_single};
 
     fn locate_photos(
@@ -477,7 +477,7 @@ mod tests {
     fn answers_that_contradict_each_other_are_not_mixed() {
         let photo = |verdict, x: f64| PhotoLocalization {
             name: String::new(),
-            camera: crate::test_scene::pinhole(),
+            camera: crate::synthetic::pinhole(),
             world_from_camera: Some(Rigid::new(UnitQuaternion::identity(), Vector3::new(x, 0.0, 0.0))),
             covariance: Some(nalgebra::Matrix6::identity() * 1e-4),
             inliers: 20,
