@@ -157,7 +157,9 @@ fn write_results(
         None => write_colmap(&folder.join("colmap"), &merged, &[])?,
     }
     write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?)?;
-    write_json(&folder.join("report.json"), &session.report.to_json())
+    let mut report = session.report.to_json();
+    report["warnings"] = json!(located.warnings);
+    write_json(&folder.join("report.json"), &report)
 }
 
 #[cfg(test)]
