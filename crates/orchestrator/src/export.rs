@@ -7,7 +7,7 @@ mod ply;
 mod poses;
 mod top_view;
 
-pub use colmap::{colmap_lacks, write_colmap};
+pub use colmap::{colmap_lacks, renew_colmap, write_colmap};
 pub use geojson::geojson;
 pub use nerfstudio::nerfstudio;
 pub use ply::ply;
