@@ -289,6 +289,8 @@ pub enum ExportFormat {
     Nerfstudio,
     /// Camera positions on the map
     Geojson,
+    /// The same as placemarks, for globes
+    Kml,
     /// All poses
     Json,
     /// Picture from above (PNG)
