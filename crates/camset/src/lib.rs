@@ -20,8 +20,7 @@ mod params;
 mod refine;
 mod set;
 mod single;
-#[cfg(test)]
-mod test_scene;
+pub mod synthetic;
 mod types;
 mod verdict;
 mod views;

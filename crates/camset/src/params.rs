@@ -106,6 +106,9 @@ pub enum CamsetMethod {
 pub struct CamsetParams {
     /// Solver of the rigid pose.
     pub method: CamsetMethod,
+    /// Whether poses that photos alone, their local points' depths and the scene's images suggest compete with the
+    /// solver's; the paper has none.
+    pub other_hypotheses: bool,
     /// Distance ratio of the two scene points nearest to a local point (the paper: 0.6).
     pub ratio: f64,
     /// Distance ratio of the two local points nearest to a scene point (the paper: 0.6).
@@ -130,6 +133,7 @@ impl Default for CamsetParams {
     fn default() -> Self {
         Self {
             method: CamsetMethod::Gp4ps,
+            other_hypotheses: true,
             ratio: 0.8,
             reverse_ratio: 0.9,
             lone_rays: true,
@@ -144,10 +148,11 @@ impl Default for CamsetParams {
 }
 
 impl CamsetParams {
-    /// The paper's settings: DLT, both ratios 0.6, no lone rays.
+    /// The paper's settings: DLT and no other hypotheses, both ratios 0.6, neither lone rays nor the scene's images.
     pub fn paper() -> Self {
         Self {
             method: CamsetMethod::Dlt,
+            other_hypotheses: false,
             ratio: 0.6,
             reverse_ratio: 0.6,
             lone_rays: false,

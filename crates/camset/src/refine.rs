@@ -490,7 +490,7 @@ fn covariances(problem: &BundleProblem, photos: usize, loss: RobustLoss) -> Vec<
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::test_scene::World;
+    use crate::synthetic::World;
 
     #[test]
     fn exact_scene_points_hold_a_photo_and_tell_its_covariance() {

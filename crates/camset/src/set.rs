@@ -306,7 +306,7 @@ mod tests {
 
     use super::*;
     use crate::jackknife::deviation;
-    use crate::test_scene::{Place, World, along_street};
+    use crate::synthetic::{Place, World, along_street};
     use crate::{CamsetMethod, PathToScene, SingleParams, locate_single};
 
     fn locate_photos(
@@ -365,6 +365,10 @@ mod tests {
 
     /// A set whose scene has no point that any of its photos shows.
     fn locate_by_views(panoramas: &[u32], seed: u64) -> (World, SetLocalization) {
+        locate_by_views_with(&CamsetParams::default(), panoramas, seed)
+    }
+
+    fn locate_by_views_with(params: &CamsetParams, panoramas: &[u32], seed: u64) -> (World, SetLocalization) {
         let mut world = World::chain(6, 0.2, seed);
         world.forget_seen_points();
         let alone = |photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7);
@@ -372,8 +376,17 @@ mod tests {
         let models = std::slice::from_ref(&world.local);
         let photos = (&*world.queries(), &*alone);
         let views = || world.views(panoramas);
-        let found = locate_with(&CamsetParams::default(), &world.scene(), photos, models, views, 7);
+        let found = locate_with(params, &world.scene(), photos, models, views, 7);
         (world, found)
+    }
+
+    #[test]
+    fn without_other_hypotheses_only_the_solver_places_a_set() {
+        // It goes by scene points, of which this set sees none.
+        let params = CamsetParams { other_hypotheses: false, ..CamsetParams::default() };
+        let (_, found) = locate_by_views_with(&params, &[5, 7], 1);
+        assert!(found.world_from_set.is_empty());
+        assert!(!locate_by_views(&[5, 7], 1).1.world_from_set.is_empty());
     }
 
     #[test]
@@ -464,7 +477,7 @@ mod tests {
     fn answers_that_contradict_each_other_are_not_mixed() {
         let photo = |verdict, x: f64| PhotoLocalization {
             name: String::new(),
-            camera: crate::test_scene::pinhole(),
+            camera: crate::synthetic::pinhole(),
             world_from_camera: Some(Rigid::new(UnitQuaternion::identity(), Vector3::new(x, 0.0, 0.0))),
             covariance: Some(nalgebra::Matrix6::identity() * 1e-4),
             inliers: 20,

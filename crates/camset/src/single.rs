@@ -328,7 +328,7 @@ fn with_focal_factor(camera: &Camera, factor: f64) -> Camera {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::test_scene::World;
+    use crate::synthetic::World;
 
     fn locate(world: &World, photo: usize) -> PhotoLocalization {
         locate_single(&SingleParams::default(), &world.scene(), &world.queries()[photo], 3).photo

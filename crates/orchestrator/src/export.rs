@@ -1,14 +1,17 @@
 //! Scenes and poses as files that people and other programs read.
 
 mod colmap;
+mod geographic;
 mod geojson;
+mod kml;
 mod nerfstudio;
 mod ply;
 mod poses;
 mod top_view;
 
-pub use colmap::{colmap_lacks, write_colmap};
+pub use colmap::{colmap_lacks, renew_colmap, write_colmap};
 pub use geojson::geojson;
+pub use kml::kml;
 pub use nerfstudio::nerfstudio;
 pub use ply::ply;
 pub use poses::{localizations_json, pose_json, scene_json};

@@ -38,6 +38,8 @@ pub struct Located {
     pub local_models: Vec<usize>,
     /// Photos that could not be used, and why.
     pub skipped: Vec<SkippedImage>,
+    /// What is odd about the photos.
+    pub warnings: Vec<String>,
 }
 
 impl Located {
@@ -82,7 +84,8 @@ pub fn locate(
     name: &str,
     target: &str,
 ) -> Result<Located> {
-    let mut located = Located { skipped: folder.skipped.clone(), ..Located::default() };
+    let (skipped, warnings) = (folder.skipped.clone(), folder.warnings.clone());
+    let mut located = Located { skipped, warnings, ..Located::default() };
     let mut whole = RunResult::default();
     if matches!(mode, Mode::Auto | Mode::Single) {
         whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);

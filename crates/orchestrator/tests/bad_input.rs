@@ -53,6 +53,8 @@ fn bad_images_among_good_ones_are_skipped_with_a_reason() {
     assert!(report.contains("panoramas/pano_003.jpg\tregistered"), "{report}");
     assert!(report.contains("not registered: panoramas/black.jpg;"), "{report}");
     assert!(report.contains("skipped panoramas/truncated.jpg: "), "{report}");
+    let equal = "warning: images of equal content: panoramas/again.jpg and panoramas/pano_000.jpg\n";
+    assert_eq!(report.matches(equal).count(), 1, "{report}");
 }
 
 #[test]

@@ -91,6 +91,15 @@ fn report_and_status_tell_what_came_out() {
         status.contains("jobs ran, 0 were stored, 0 failed") && status.contains("features\t8"),
         "{status}"
     );
+
+    // Photos without cameras.json, one of them twice.
+    let photos = folder.path().join("town/queries/lane");
+    std::fs::copy(photos.join("img_00.jpg"), photos.join("img_04.jpg")).unwrap();
+    let locate_again = run(&["locate", "s.setloc", "town/queries/lane", "-o", "again", "--mode", "single"]);
+    assert!(matches!(locate_again.status.code(), Some(0 | 1)), "{}", said(&locate_again));
+    let of_again = gave(&run(&["report", "again"]));
+    let equal = "warning: images of equal content: lane/img_00.jpg and lane/img_04.jpg\n";
+    assert!(of_again.contains(equal) && of_again.contains("warning: focal length unknown, "), "{of_again}");
 }
 
 #[test]

@@ -1,23 +1,25 @@
 //! Time per call of the solvers and estimators, and how often they find the truth.
 //!
 //! `cargo bench --bench solvers` prints, before the timings, solutions and misses per 1000 exact problems (100 000
-//! problems each) and the medians of the robust estimators over 1000 problems.
+//! problems each, with noise for triangulation) and the medians of the robust estimators over 1000 problems.
 
 use std::hint::black_box;
 use std::time::Instant;
 
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
+use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use setloc_sfm::robust::{
     GeneralizedPoseOptions, GeneralizedSolver, RansacParams, estimate_absolute_pose,
     estimate_generalized_pose, estimate_relative_pose,
 };
 use setloc_sfm::solvers::essential::essential_from_pose;
+use setloc_sfm::solvers::triangulation::{WorldRay, triangulate, triangulate_two_views};
 use setloc_sfm::solvers::{PoseWithFocal, dlt, five_point, gp3p, gp4ps, p3p, p4pf, ugp3ps};
 use setloc_sfm::synthetic::{
-    AbsoluteProblem, FocalProblem, GeneralizedProblem, RaySample, RelativeProblem, rotation_angle,
-    same_similarity, seeded,
+    AbsoluteProblem, FocalProblem, GeneralizedProblem, RaySample, RelativeProblem, perturb, random_unit,
+    rotation_angle, same_similarity, seeded,
 };
 use setloc_sfm::{Rigid, Similarity};
 
@@ -152,6 +154,46 @@ fn minimal(criterion: &mut Criterion) {
     });
 }
 
+/// Rays with noise to a point from centres on the unit sphere, and the point.
+fn views(rng: &mut ChaCha8Rng, count: usize) -> (Vec<WorldRay>, Vector3<f64>) {
+    let point = random_unit(rng) * rng.random_range(2.0..10.0);
+    let ray = |_| {
+        let origin = random_unit(rng);
+        WorldRay { origin, direction: perturb(rng, &(point - origin).normalize(), SIGMA), sigma: SIGMA }
+    };
+    ((0..count).map(ray).collect(), point)
+}
+
+fn triangulation(criterion: &mut Criterion) {
+    // With noise the point is found when its rays do: within four deviations of each.
+    let fits = |rays: &[WorldRay], point: &Vector3<f64>| {
+        rays.iter().all(|ray| ray.angular_error(point) < 4.0 * SIGMA)
+    };
+    let two = |rng: &mut ChaCha8Rng| {
+        let (rays, point) = views(rng, 2);
+        // Both cameras look along the axes of the world.
+        let second_from_first = Rigid::new(UnitQuaternion::identity(), rays[0].origin - rays[1].origin);
+        ((second_from_first, [rays[0], rays[1]]), point)
+    };
+    solver(criterion, "triangulate_two_views", two, |(second_from_first, rays), truth| {
+        let found = triangulate_two_views(second_from_first, &rays[0].direction, &rays[1].direction);
+        let right = truth.is_none() || found.is_some_and(|point| fits(rays, &(point + rays[1].origin)));
+        (usize::from(found.is_some()), right)
+    });
+    for (name, count) in [("triangulate 2 views", 2), ("triangulate 8 views", 8)] {
+        solver(
+            criterion,
+            name,
+            |rng| views(rng, count),
+            |rays, truth| {
+                let found = triangulate(rays);
+                let right = truth.is_none() || found.is_some_and(|point| fits(rays, &point));
+                (usize::from(found.is_some()), right)
+            },
+        );
+    }
+}
+
 fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
@@ -238,5 +280,5 @@ fn robust(criterion: &mut Criterion) {
     });
 }
 
-criterion_group!(benches, minimal, robust);
+criterion_group!(benches, minimal, triangulation, robust);
 criterion_main!(benches);

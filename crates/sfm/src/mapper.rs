@@ -57,7 +57,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 17;
+pub const MAPPER_VERSION: u32 = 18;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -291,8 +291,9 @@ fn reconstruct_images(params: &MapperParams, input: &MapperInput<'_>, seed: u64)
     let mut report = MapperReport::default();
     let mut parts: Vec<Part> = Vec::new();
     let mut taken = vec![false; input.images.len()];
+    let mut barren = vec![false; input.images.len()];
     while let Some(mut mapper) = Mapper::new(params, input, taken.clone(), seed) {
-        let found = mapper.initialize();
+        let found = mapper.initialize(&mut barren);
         if found {
             mapper.grow();
             mapper.finish();
@@ -338,6 +339,9 @@ struct Part {
 fn enabled_pairs(input: &MapperInput<'_>, taken: &[bool]) -> Vec<bool> {
     input.pairs.iter().map(|pair| !taken[pair.first.index()] && !taken[pair.second.index()]).collect()
 }
+
+/// How often pairs are ranked for one component, each time without the images of those that were tried in vain.
+const MAX_STARTS: usize = 4;
 
 /// A verified pair of a registered image and one that waits.
 struct Edge {
@@ -403,8 +407,33 @@ impl<'a> Mapper<'a> {
         Part { component: self.model.into_reconstruction(), anchors: self.anchors }
     }
 
-    fn initialize(&mut self) -> bool {
-        for candidate in initial::ranked_pairs(self.params, &self.model, &self.graph, &self.enabled) {
+    /// Starts from the best pair that gives points; whether there is one.
+    ///
+    /// Images of pairs that were tried in vain are `barren`: what they share looks good and is not, and would keep all
+    /// other places from being tried. No component starts from them, but they may join one.
+    fn initialize(&mut self, barren: &mut [bool]) -> bool {
+        for _ in 0..MAX_STARTS {
+            let fruitful = |pair: &PairGeometry| !barren[pair.first.index()] && !barren[pair.second.index()];
+            let worth: Vec<bool> = (self.enabled.iter().zip(self.model.input.pairs))
+                .map(|(enabled, pair)| *enabled && fruitful(pair))
+                .collect();
+            let ranked = initial::ranked_pairs(self.params, &self.model, &self.graph, &worth);
+            if ranked.is_empty() {
+                return false;
+            }
+            if self.start_from(&ranked) {
+                return true;
+            }
+            for pair in ranked.into_iter().map(|candidate| &self.model.input.pairs[candidate]) {
+                barren[pair.first.index()] = true;
+                barren[pair.second.index()] = true;
+            }
+        }
+        false
+    }
+
+    fn start_from(&mut self, ranked: &[usize]) -> bool {
+        for &candidate in ranked {
             let pair = &self.model.input.pairs[candidate];
             let (first, second) = (pair.first, pair.second);
             self.model.set_pose(first, Some(Rigid::identity()));

@@ -119,6 +119,10 @@ impl Street {
     }
 
     fn map(&self, cameras: &[Camera], fixed: bool) -> MapperOutput {
+        self.map_pairs(&MapperParams::default(), cameras, fixed, &self.verified_pairs(cameras))
+    }
+
+    fn verified_pairs(&self, cameras: &[Camera]) -> Vec<PairGeometry> {
         let mut rng = ChaCha8Rng::seed_from_u64(99);
         let rays: Vec<_> =
             self.features.iter().zip(cameras).map(|(features, camera)| features.rays(camera)).collect();
@@ -137,6 +141,16 @@ impl Street {
                 }
             }
         }
+        pairs
+    }
+
+    fn map_pairs(
+        &self,
+        params: &MapperParams,
+        cameras: &[Camera],
+        fixed: bool,
+        pairs: &[PairGeometry],
+    ) -> MapperOutput {
         // Photos share one camera, panoramas have one each: both are allowed.
         let shared = cameras.iter().all(|camera| camera == &cameras[0]);
         let images = (0..self.features.len()).map(|index| {
@@ -148,11 +162,11 @@ impl Street {
             camera_fixed: vec![fixed; cameras.len()],
             cameras,
             images: images.collect(),
-            pairs: &pairs,
+            pairs,
             putative: &[],
             two_view: TwoViewParams::default(),
         };
-        reconstruct(&MapperParams::default(), &input, 5)
+        reconstruct(params, &input, 5)
     }
 
     /// Largest centre error in metres and rotation error in degrees after alignment of the first component.
@@ -279,6 +293,39 @@ fn two_streets_without_a_common_view_are_two_components() {
     let sizes: Vec<usize> =
         output.components.iter().map(|component| component.registered().count()).collect();
     assert_eq!(sizes, [5, 5]);
+}
+
+#[test]
+fn pairs_that_promise_much_and_give_nothing_keep_no_other_street_from_being_mapped() {
+    let mut street = Street::of_panoramas(10, 0.3, 0, 6);
+    for image in 5..10 {
+        for point in &mut street.point_of[image] {
+            *point += 100_000;
+        }
+    }
+    street.look = (0..200_000).collect();
+    let mut pairs = street.verified_pairs(&street.cameras);
+    for PairGeometry { first, second, two_view } in &mut pairs {
+        if first.index() >= 5 {
+            two_view.inliers.truncate(two_view.inliers.len() / 2);
+            continue;
+        }
+        // Each image shows other points than its matches say, the same ones in all of them.
+        let other = |image: &ImageId, feature: u32| {
+            (feature + 31 * image.0) % street.features[image.index()].len() as u32
+        };
+        for m in &mut two_view.inliers {
+            *m = Match { first: other(first, m.first), second: other(second, m.second) };
+        }
+    }
+    let params = MapperParams { max_initial_pairs: 4, ..MapperParams::default() };
+    let output = street.map_pairs(&params, &street.cameras, true, &pairs);
+    let registered: Vec<Vec<u32>> = output
+        .components
+        .iter()
+        .map(|component| component.registered().map(|image| image.0).collect())
+        .collect();
+    assert_eq!(registered, [[5, 6, 7, 8, 9]]);
 }
 
 /// What of a street's matches crosses from its first images to the others.

@@ -34,8 +34,7 @@ pub(crate) struct SetPhotos<'a> {
     pub evidence: &'a [&'a SingleLocalization],
 }
 
-/// Finds the pose of greatest truncated score among those of the solver, those of photos localized alone and those
-/// that single photos suggest together with the depths of their local points.
+/// Finds the pose of greatest truncated score among that of the solver and, unless `params` leave them out, others.
 pub(crate) fn rigid_pose(
     params: &CamsetParams,
     correspondences: &[SetCorrespondence],
@@ -44,30 +43,11 @@ pub(crate) fn rigid_pose(
     photos: &SetPhotos<'_>,
     seed: u64,
 ) -> Option<RigidPose> {
-    let SetPhotos { set_from_camera, members, evidence } = *photos;
+    let set_from_camera = photos.set_from_camera;
     let count = correspondences.len();
     let mut candidates: Vec<Similarity> = estimate(params, rays, seed).into_iter().collect();
-    candidates.extend(alignments(set_from_camera, members, evidence));
-    candidates.extend(sights.estimate(params, &[], &rays.rays, seed));
-    for (slot, &photo) in members.iter().enumerate() {
-        let in_set = &set_from_camera[slot];
-        let alone = evidence[photo]
-            .photo
-            .world_from_camera
-            .map(|in_world| Rigid::new(in_world.rotation * in_set.rotation.inverse(), in_world.translation));
-        let view = rays.of_slot(slot);
-        let sampled = view.absolute_pose(params, seed.wrapping_add(slot as u64));
-        for axes_at_photo in alone.into_iter().chain(sampled) {
-            candidates.extend(view.with_local_depths(
-                params,
-                &axes_at_photo,
-                correspondences,
-                model,
-                ImageId(photo as u32),
-            ));
-            let about = About::photo(&axes_at_photo, in_set.translation);
-            candidates.extend(rays.with_baselines(params, &about));
-        }
+    if params.other_hypotheses {
+        candidates.extend(other_hypotheses(params, correspondences, model, (rays, sights), photos, seed));
     }
     let bound = params.max_error_sigmas;
     let score = |pose: &Similarity| rays.score(pose, bound, count) + sights.score(pose, bound);
@@ -102,6 +82,42 @@ pub(crate) fn rigid_pose(
         runner_up: by_rays.max(by_sights),
         observability,
     })
+}
+
+/// Poses by photos localized alone, by what the scene's images show, and those that single photos suggest together with
+/// the depths of their local points.
+fn other_hypotheses(
+    params: &CamsetParams,
+    correspondences: &[SetCorrespondence],
+    model: &Reconstruction,
+    (rays, sights): (&SetRays, &Sights),
+    photos: &SetPhotos<'_>,
+    seed: u64,
+) -> Vec<Similarity> {
+    let SetPhotos { set_from_camera, members, evidence } = *photos;
+    let mut found = alignments(set_from_camera, members, evidence);
+    found.extend(sights.estimate(params, &[], &rays.rays, seed));
+    for (slot, &photo) in members.iter().enumerate() {
+        let in_set = &set_from_camera[slot];
+        let alone = evidence[photo]
+            .photo
+            .world_from_camera
+            .map(|in_world| Rigid::new(in_world.rotation * in_set.rotation.inverse(), in_world.translation));
+        let view = rays.of_slot(slot);
+        let sampled = view.absolute_pose(params, seed.wrapping_add(slot as u64));
+        for axes_at_photo in alone.into_iter().chain(sampled) {
+            found.extend(view.with_local_depths(
+                params,
+                &axes_at_photo,
+                correspondences,
+                model,
+                ImageId(photo as u32),
+            ));
+            let about = About::photo(&axes_at_photo, in_set.translation);
+            found.extend(rays.with_baselines(params, &about));
+        }
+    }
+    found
 }
 
 fn estimate(params: &CamsetParams, rays: &SetRays, seed: u64) -> Option<Similarity> {

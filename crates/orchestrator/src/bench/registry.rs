@@ -170,6 +170,8 @@ pub fn checksum_of(folder: &Path) -> Result<ContentHash> {
 
 #[cfg(test)]
 mod tests {
+    use setloc_camset::CamsetParams;
+
     use super::*;
 
     fn registry(text: &str) -> Result<Registry> {
@@ -190,6 +192,15 @@ mod tests {
         assert!(error(&wrong).contains("parameter set `b`"));
         let mut one = registry(ENTRY).unwrap();
         assert!(format!("{:#}", one.keep_only(&["b".to_owned()]).unwrap_err()).contains("`b`"));
+    }
+
+    #[test]
+    fn the_papers_parameter_set_has_the_papers_settings() {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+        let registry = Registry::read(&root.join("benchmarks/datasets.toml")).unwrap();
+        let dlt = registry.parameters.iter().find(|set| set.name == "dlt").unwrap();
+        let config = Config::resolve(None, &dlt.settings).unwrap();
+        assert_eq!(config, Config { camset: CamsetParams::paper(), ..Config::default() });
     }
 
     #[test]

@@ -109,7 +109,7 @@ pub struct SourceArgs {
     /// Positions: a table `name,lat,lon,alt`, or `exif`
     #[arg(long, value_name = "geo.csv|exif")]
     pub gps: Option<String>,
-    /// Folder of mask images, named as the images; black is left out
+    /// Folder of mask images, named as the images, in their folders or not; black is left out
     #[arg(long, value_name = "DIR")]
     pub masks: Option<PathBuf>,
     /// Known intrinsics
@@ -289,6 +289,8 @@ pub enum ExportFormat {
     Nerfstudio,
     /// Camera positions on the map
     Geojson,
+    /// The same as placemarks, for globes
+    Kml,
     /// All poses
     Json,
     /// Picture from above (PNG)

@@ -12,7 +12,7 @@ use crate::building::{BuildOutcome, Built, alike_pairs, build_scene};
 use crate::config::Config;
 use crate::dataset::{ImageFolder, SkippedImage, list_images};
 use crate::error::Hinted;
-use crate::export::{Marker, colmap_lacks, ply, scene_json, top_view_png, write_colmap};
+use crate::export::{Marker, colmap_lacks, ply, renew_colmap, scene_json, top_view_png};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, Prediction};
 use crate::jobs::{LikelyJobs, add_scene};
@@ -184,11 +184,8 @@ fn write_models(folder: &Path, built: &Built) -> Result<()> {
         .map(|image| built.features.get(&image.name).map(|features| &**features))
         .collect();
     let writers: [&(dyn Fn() -> Result<()> + Sync); 4] = [
-        &|| match colmap_lacks(model) {
-            // Said when the scene is.
-            Some(_) => Ok(()),
-            None => write_colmap(&folder.join("colmap"), model, &features),
-        },
+        // What COLMAP lacks is said when the scene is.
+        &|| renew_colmap(&folder.join("colmap"), model, &features).map(drop),
         &|| write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes()),
         &|| write_json(&folder.join("poses.json"), &scene_json(&built.scene)),
         &|| write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?),

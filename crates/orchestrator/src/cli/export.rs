@@ -1,11 +1,11 @@
 use anyhow::{Context, Result};
-use setloc_sfm::Reconstruction;
+use setloc_sfm::{Reconstruction, ReconstructionImage};
 
 use super::Answer;
 use super::args::{ExportArgs, ExportFormat};
 use super::build::scene_markers;
 use crate::error::Hinted;
-use crate::export::{geojson, nerfstudio, ply, scene_json, top_view_png, write_colmap};
+use crate::export::{geojson, kml, nerfstudio, ply, scene_json, top_view_png, write_colmap};
 use crate::print;
 use crate::scene::SceneFile;
 use crate::store::write_atomically;
@@ -17,6 +17,8 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
     let needs_output =
         || Hinted::error("this format is not written to standard output", "name a file or folder with -o");
     let markers = scene_markers(model);
+    let posed = |image: &ReconstructionImage| Some((image.name.clone(), image.world_from_camera?));
+    let poses = || model.images.iter().filter_map(posed).collect::<Vec<_>>();
     let text = match args.format {
         ExportFormat::Colmap => {
             let folder = args.output.as_deref().ok_or_else(needs_output)?;
@@ -40,11 +42,8 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
         }
         ExportFormat::Nerfstudio => serde_json::to_string_pretty(&nerfstudio(model)?)?,
         ExportFormat::Json => serde_json::to_string_pretty(&scene_json(&scene))?,
-        ExportFormat::Geojson => {
-            let poses =
-                model.images.iter().filter_map(|image| Some((image.name.clone(), image.world_from_camera?)));
-            serde_json::to_string_pretty(&geojson(&poses.collect::<Vec<_>>(), scene.origin)?)?
-        }
+        ExportFormat::Geojson => serde_json::to_string_pretty(&geojson(&poses(), scene.origin)?)?,
+        ExportFormat::Kml => kml(&poses(), scene.origin)?,
     };
     match &args.output {
         Some(file) => {

@@ -11,7 +11,7 @@ use super::args::LocateArgs;
 use super::build::{remark, scene_markers, warn_skipped, write_json};
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use crate::error::Hinted;
-use crate::export::{Marker, colmap_lacks, localizations_json, ply, top_view_png, write_colmap};
+use crate::export::{Marker, localizations_json, ply, renew_colmap, top_view_png};
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, locate};
 use crate::print;
@@ -152,12 +152,13 @@ fn write_results(
     let centres: Vec<_> =
         markers.iter().map(|marker| (marker.world_from_camera.translation, marker.color)).collect();
     write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes())?;
-    match colmap_lacks(&merged) {
-        Some(lack) => print::note(&format!("warning: no COLMAP model is written: {lack}")),
-        None => write_colmap(&folder.join("colmap"), &merged, &[])?,
+    if let Some(lack) = renew_colmap(&folder.join("colmap"), &merged, &[])? {
+        print::note(&format!("warning: no COLMAP model is written: {lack}"));
     }
     write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?)?;
-    write_json(&folder.join("report.json"), &session.report.to_json())
+    let mut report = session.report.to_json();
+    report["warnings"] = json!(located.warnings);
+    write_json(&folder.join("report.json"), &report)
 }
 
 #[cfg(test)]

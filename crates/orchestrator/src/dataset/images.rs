@@ -247,13 +247,20 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
 }
 
 /// `<folder>/<file>.png`, as COLMAP names masks, or `<folder>/<stem>.png`.
+///
+/// Where the folder has the image's own folders, the longest end of its path decides, so that files of one name in
+/// several folders have masks of their own: `<folder>/north/<file>.png` comes before `<folder>/<file>.png`.
 fn find_mask(folder: &Path, image: &Path) -> Result<Option<(PathBuf, ContentHash)>> {
+    let whole = whole_path(image);
     let file = image.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let stem = image.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    let path = [format!("{file}.png"), format!("{stem}.png")]
-        .map(|name| folder.join(name))
-        .into_iter()
-        .find(|p| p.is_file());
+    let names = [format!("{file}.png"), format!("{stem}.png")];
+    let parent = whole.parent().unwrap_or(Path::new(""));
+    let ends: Vec<&Path> = parent.ancestors().filter_map(|above| parent.strip_prefix(above).ok()).collect();
+    let mut places =
+        ends.iter().rev().flat_map(|end| names.iter().map(move |name| folder.join(end).join(name)));
+    // Where masks lie beside the images, an image is not its own.
+    let path = places.find(|place| place.is_file() && whole_path(place) != whole);
     path.map(|path| {
         let bytes = std::fs::read(&path).with_context(|| format!("cannot read mask {}", path.display()))?;
         Ok((path, ContentHash::of(&bytes)))
@@ -327,5 +334,26 @@ mod tests {
         let mut names = ["a", "a", "a (2)", "a"].map(str::to_owned);
         number_alike(&mut names);
         assert_eq!(names, ["a", "a (2)", "a (2) (2)", "a (3)"]);
+    }
+
+    #[test]
+    fn masks_are_found_by_the_longest_end_of_the_images_path() {
+        let root = tempfile::tempdir().unwrap();
+        let root = root.path();
+        for mask in ["0.png", "north/0.jpg.png", "day1/north/0.png", "images/south/1.png"] {
+            let path = root.join("masks").join(mask);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, mask).unwrap();
+        }
+        let find = |folder: &str, image: &str| {
+            let found = find_mask(&root.join(folder), &root.join(image)).unwrap();
+            found.map(|(path, _)| path.strip_prefix(root).unwrap().display().to_string())
+        };
+        assert_eq!(find("masks", "day1/north/0.jpg").unwrap(), "masks/day1/north/0.png");
+        assert_eq!(find("masks", "day2/north/0.jpg").unwrap(), "masks/north/0.jpg.png");
+        assert_eq!(find("masks", "day2/south/0.jpg").unwrap(), "masks/0.png");
+        assert_eq!(find("masks", "images/south/1.jpg").unwrap(), "masks/images/south/1.png");
+        assert_eq!(find("masks", "day1/south/1.jpg"), None);
+        assert_eq!(find("masks", "masks/0.png"), None);
     }
 }

@@ -75,6 +75,9 @@ struct Report {
     stages: Vec<StageReport>,
     #[serde(default)]
     skipped: Vec<SkippedImage>,
+    /// Of the images, and of a build also its scene's.
+    #[serde(default)]
+    warnings: Vec<String>,
 }
 
 impl Digest {
@@ -105,8 +108,13 @@ impl Digest {
             Poses::Scene(scene) => of_scene(&title, scene, report.skipped),
             Poses::Located(located) => of_photos(&title, located),
         };
+        let mut warnings = report.warnings;
+        let further = digest.warnings.iter().filter(|warning| !warnings.contains(warning)).cloned();
+        let further: Vec<String> = further.collect();
+        warnings.extend(further);
         Ok(Self {
             stages: report.stages,
+            warnings,
             top_view: std::fs::read(folder.join("top_view.png")).ok(),
             ..digest
         })

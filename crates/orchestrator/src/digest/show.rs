@@ -1,11 +1,10 @@
-use std::fmt::Write;
-
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
 use super::{Digest, ImageRow, Standing};
 use crate::html::{cell, page, table};
 use crate::plot::{bars, escape};
+use crate::text::add;
 
 impl Digest {
     /// For a terminal.
@@ -75,9 +74,4 @@ fn row(image: &ImageRow) -> Vec<String> {
     let name = if image.is_target { format!("{} (target)", image.name) } else { image.name.clone() };
     let verdict = format!("<td class='{class}'>{}</td>", escape(&image.verdict));
     vec![cell(&name), verdict, cell(&image.evidence), cell(&image.reasons.join("; "))]
-}
-
-/// Writing to a string cannot fail.
-fn add(text: &mut String, part: std::fmt::Arguments<'_>) {
-    let _ = text.write_fmt(part);
 }

@@ -1,5 +1,6 @@
 use std::collections::BTreeSet;
 use std::fmt::Write;
+use std::io::ErrorKind;
 use std::path::Path;
 
 use anyhow::Result;
@@ -10,6 +11,8 @@ use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage, ReconstructionPo
 use crate::error::Hinted;
 use crate::store::write_pieces_atomically;
 
+/// What a model consists of.
+const FILES: [&str; 3] = ["cameras.txt", "images.txt", "points3D.txt"];
 /// Points whose lines are made, and written, at once.
 const POINTS_OF_PIECE: usize = 2048;
 /// About what the lines of a point and of a keypoint take; more is made room for.
@@ -114,15 +117,39 @@ pub fn write_colmap(
     let points_head = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n";
     let images_head = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n\
                        # POINTS2D[] as (X, Y, POINT3D_ID)\n";
-    let files = [
-        ("cameras.txt", cameras.as_str(), Vec::new()),
-        ("images.txt", images_head, images?),
-        ("points3D.txt", points_head, points?),
-    ];
-    files.par_iter().with_max_len(1).try_for_each(|(name, head, lines)| {
+    let files = [(cameras.as_str(), Vec::new()), (images_head, images?), (points_head, points?)];
+    FILES.par_iter().zip(&files).with_max_len(1).try_for_each(|(name, (head, lines))| {
         let pieces = std::iter::once(*head).chain(lines.iter().map(String::as_str));
         write_pieces_atomically(&folder.join(name), pieces.map(str::as_bytes))
     })
+}
+
+/// Writes a model as [`write_colmap`] does; what COLMAP lacks of it, and then no model of an earlier run is left either.
+///
+/// # Errors
+/// When a file cannot be written or removed.
+pub fn renew_colmap(
+    folder: &Path,
+    model: &Reconstruction,
+    features: &[Option<&ImageFeatures>],
+) -> Result<Option<String>> {
+    let Some(lack) = colmap_lacks(model) else {
+        write_colmap(folder, model, features)?;
+        return Ok(None);
+    };
+    for name in FILES {
+        let file = folder.join(name);
+        match std::fs::remove_file(&file) {
+            Err(error) if error.kind() != ErrorKind::NotFound => {
+                let what = format!("cannot remove {}, which is of an earlier scene", file.display());
+                return Err(anyhow::Error::new(error).context(what));
+            }
+            _ => {}
+        }
+    }
+    // It stays where somebody else's files are in it.
+    let _ = std::fs::remove_dir(folder);
+    Ok(Some(lack))
 }
 
 #[cfg(test)]
@@ -215,5 +242,23 @@ mod tests {
         assert_eq!(crop, "COLMAP's EQUIRECTANGULAR is a whole panorama, and 0.jpg is cropped");
         let paper = refused(CameraModel::PaperRectilinear, &[100.0, 50.0, 25.0]);
         assert_eq!(paper, "COLMAP has no camera model PAPER_RECTILINEAR, which 0.jpg has");
+    }
+
+    #[test]
+    fn a_model_that_is_not_written_leaves_none_of_an_earlier_run() {
+        let whole = scene(Camera::equirectangular(100, 50), &[]);
+        let params = vec![200.0, 100.0, 50.0, 25.0];
+        let cropped = scene(Camera { params, ..Camera::equirectangular(100, 50) }, &[]);
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("colmap");
+        assert!(renew_colmap(&folder, &cropped, &[]).unwrap().is_some());
+        assert_eq!(renew_colmap(&folder, &whole, &[]).unwrap(), None);
+        assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 3);
+        assert!(renew_colmap(&folder, &cropped, &[]).unwrap().is_some());
+        assert!(!folder.exists());
+        assert_eq!(renew_colmap(&folder, &whole, &[]).unwrap(), None);
+        std::fs::write(folder.join("rigs.txt"), "").unwrap();
+        assert!(renew_colmap(&folder, &cropped, &[]).unwrap().is_some());
+        assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1);
     }
 }

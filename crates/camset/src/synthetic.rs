@@ -1,4 +1,7 @@
-//! A street with truth: panoramas at its beginning, a chain of photos that leads away from them.
+//! A street with truth, for tests and benches: panoramas at its beginning, a chain of photos that leads away from them.
+
+// What it takes apart it has made itself.
+#![allow(clippy::unwrap_used, clippy::missing_panics_doc)]
 
 use std::collections::BTreeSet;
 
@@ -20,15 +23,18 @@ const VISIBLE: f64 = 35.0;
 const EXTENT: f64 = 0.3;
 
 /// Points with their descriptors.
-pub(crate) struct Place {
+pub struct Place {
     positions: Vec<Vector3<f64>>,
     descriptors: Vec<Vec<u8>>,
 }
 
 /// What a camera sees: features, and which point each shows (`None` is clutter).
-pub(crate) struct View {
+pub struct View {
+    /// Its features.
     pub features: ImageFeatures,
+    /// The place's point of each feature.
     pub shows: Vec<Option<usize>>,
+    /// Where it was taken (`world_from_camera`).
     pub pose: Rigid,
 }
 
@@ -38,7 +44,7 @@ fn random_descriptor(rng: &mut ChaCha8Rng) -> Vec<u8> {
 
 impl Place {
     /// Two walls 16 units apart along a street of 130 units, y down.
-    pub(crate) fn street(points: usize, seed: u64) -> Self {
+    pub fn street(points: usize, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let positions = (0..points)
             .map(|_| {
@@ -52,7 +58,7 @@ impl Place {
     }
 
     /// Another place of the same details: every point looks like some point of this place, at random.
-    pub(crate) fn shuffled(mut self, seed: u64) -> Self {
+    pub fn shuffled(mut self, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         for i in (1..self.descriptors.len()).rev() {
             self.descriptors.swap(i, rng.random_range(0..=i));
@@ -62,7 +68,7 @@ impl Place {
 
     /// Renders one view: `outliers` is the share of features that look like other points, `change` the illumination's
     /// effect on descriptors.
-    pub(crate) fn view(&self, camera: &Camera, pose: Rigid, outliers: f64, change: i16, seed: u64) -> View {
+    pub fn view(&self, camera: &Camera, pose: Rigid, outliers: f64, change: i16, seed: u64) -> View {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut features = ImageFeatures { width: camera.width, height: camera.height, ..Default::default() };
         let mut shows = Vec::new();
@@ -134,35 +140,42 @@ fn model_of(place: &Place, views: &[View], camera: &Camera) -> (Reconstruction, 
 }
 
 /// Panoramas, their model and index; a chain of photos and their local model.
-pub(crate) struct World {
+pub struct World {
     /// Which point of the place each scene point is.
     scene_points: Vec<usize>,
     panoramas: Vec<View>,
+    /// Poses of the panoramas and the points that two of them show.
     pub scene_model: Reconstruction,
+    /// Of those points.
     pub index: SceneIndex,
+    /// Of all photos.
     pub camera: Camera,
+    /// In the order in which they were taken.
     pub photos: Vec<View>,
+    /// Of the photos.
     pub names: Vec<String>,
     /// Local model in its own frame.
     pub local: Reconstruction,
 }
 
-pub(crate) fn pinhole() -> Camera {
+/// A photo camera of 1200 × 900 pixels and 74° width.
+pub fn pinhole() -> Camera {
     Camera { model: CameraModel::Pinhole, width: 1200, height: 900, params: vec![800.0, 800.0, 600.0, 450.0] }
 }
 
 /// A pose at `center` that looks along the street, turned by `yaw` about the vertical.
-pub(crate) fn along_street(center: Vector3<f64>, yaw: f64) -> Rigid {
+pub fn along_street(center: Vector3<f64>, yaw: f64) -> Rigid {
     Rigid::new(UnitQuaternion::from_axis_angle(&Vector3::y_axis(), yaw), center)
 }
 
 impl World {
     /// The usual world: eight panoramas, then photos every six units from z = 20 on.
-    pub(crate) fn chain(photos: usize, outliers: f64, seed: u64) -> Self {
+    pub fn chain(photos: usize, outliers: f64, seed: u64) -> Self {
         Self::chain_in(&Place::street(3500, seed), photos, outliers, seed)
     }
 
-    pub(crate) fn chain_in(place: &Place, photos: usize, outliers: f64, seed: u64) -> Self {
+    /// The usual panoramas and photos in another place.
+    pub fn chain_in(place: &Place, photos: usize, outliers: f64, seed: u64) -> Self {
         let poses: Vec<Rigid> = (0..photos)
             .map(|i| {
                 along_street(
@@ -174,7 +187,8 @@ impl World {
         Self::new(place, &poses, outliers, seed)
     }
 
-    pub(crate) fn new(place: &Place, poses: &[Rigid], outliers: f64, seed: u64) -> Self {
+    /// The usual panoramas and photos of these poses.
+    pub fn new(place: &Place, poses: &[Rigid], outliers: f64, seed: u64) -> Self {
         let panorama = Camera::equirectangular(3000, 1500);
         let panoramas: Vec<View> = (0..8)
             .map(|i| {
@@ -211,7 +225,7 @@ impl World {
 
     /// Bends the local model: each photo, with the points it is the first to see, is turned by `angle` and stretched
     /// by `stretch` against the one before.
-    pub(crate) fn bend(&mut self, angle: f64, stretch: f64) {
+    pub fn bend(&mut self, angle: f64, stretch: f64) {
         let poses: Vec<Rigid> =
             self.local.images.iter().map(|image| image.world_from_camera.unwrap()).collect();
         let mut drift = vec![Similarity::identity()];
@@ -232,7 +246,7 @@ impl World {
 
     /// Leaves the last photo nothing in common with any but the one before, in points that only these two see, and
     /// records the length of its baseline as planes would tell it: `error` and `deviation` are of its logarithm.
-    pub(crate) fn cut_last(&mut self, error: f64, deviation: f64) {
+    pub fn cut_last(&mut self, error: f64, deviation: f64) {
         let last = self.photos.len() as u32 - 1;
         self.local.points.retain_mut(|point| {
             let is_tie = point.track.iter().any(|seen| seen.image.0 == last);
@@ -265,7 +279,7 @@ impl World {
     }
 
     /// Aligns the local points: each view shows them to `noise_px`.
-    pub(crate) fn align(&mut self, noise_px: f64, seed: u64) {
+    pub fn align(&mut self, noise_px: f64, seed: u64) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         for point in &mut self.local.points {
             let place = |seen: &Observation| {
@@ -283,7 +297,7 @@ impl World {
     }
 
     /// Lets the keypoints of photo `i` err alike: away from the middle by the share `i · share`.
-    pub(crate) fn stretch_keypoints(&mut self, share: f64) {
+    pub fn stretch_keypoints(&mut self, share: f64) {
         let middle = self.camera.width as f32 / 2.0;
         for (i, view) in self.photos.iter_mut().enumerate() {
             for keypoint in &mut view.features.keypoints {
@@ -295,7 +309,7 @@ impl World {
     /// Makes a scene whose points, by turns, stand where they are and `offset` away: two equal halves of evidence.
     ///
     /// Every second scene point is moved to its twin's place, so that the photos' matches support both places alike.
-    pub(crate) fn split_scene(&mut self, offset: Vector3<f64>) {
+    pub fn split_scene(&mut self, offset: Vector3<f64>) {
         for point in self.scene_model.points.iter_mut().step_by(2) {
             point.position += offset;
         }
@@ -304,7 +318,7 @@ impl World {
     }
 
     /// Leaves the scene none of the points that a photo shows, as where panoramas stand too far apart to share them.
-    pub(crate) fn forget_seen_points(&mut self) {
+    pub fn forget_seen_points(&mut self) {
         let seen: BTreeSet<usize> =
             self.photos.iter().flat_map(|photo| photo.shows.iter().flatten().copied()).collect();
         let keep: Vec<bool> = self.scene_points.iter().map(|point| !seen.contains(point)).collect();
@@ -317,7 +331,7 @@ impl World {
     }
 
     /// What the photos share with some of the panoramas.
-    pub(crate) fn views(&self, panoramas: &[u32]) -> Views {
+    pub fn views(&self, panoramas: &[u32]) -> Views {
         let features = (0..)
             .zip(&self.panoramas)
             .map(|(image, view)| panoramas.contains(&image).then(|| view.features.clone()));
@@ -335,7 +349,7 @@ impl World {
     }
 
     /// Makes the scene's points exact: without noise in the panoramas, the index gives them no covariance.
-    pub(crate) fn make_scene_exact(&mut self) {
+    pub fn make_scene_exact(&mut self) {
         for keypoint in self.panoramas.iter_mut().flat_map(|view| &mut view.features.keypoints) {
             keypoint.noise_px = 0.0;
         }
@@ -344,7 +358,7 @@ impl World {
     }
 
     /// The true matches of a photo to the scene.
-    pub(crate) fn scene_matches(&self, photo: usize) -> Vec<SceneMatch> {
+    pub fn scene_matches(&self, photo: usize) -> Vec<SceneMatch> {
         let scene_point = |shown: &Option<usize>| self.scene_points.binary_search(shown.as_ref()?).ok();
         (0..)
             .zip(&self.photos[photo].shows)
@@ -354,11 +368,13 @@ impl World {
             .collect()
     }
 
-    pub(crate) fn scene(&self) -> Scene<'_> {
+    /// The panoramas' model and its index.
+    pub fn scene(&self) -> Scene<'_> {
         Scene { reconstruction: &self.scene_model, index: &self.index }
     }
 
-    pub(crate) fn queries(&self) -> Vec<QueryPhoto<'_>> {
+    /// The photos, intrinsics known.
+    pub fn queries(&self) -> Vec<QueryPhoto<'_>> {
         self.photos
             .iter()
             .zip(&self.names)
@@ -372,13 +388,13 @@ impl World {
     }
 
     /// Centre error in scene units and rotation error in degrees.
-    pub(crate) fn errors(&self, photo: usize, pose: &Rigid) -> (f64, f64) {
+    pub fn errors(&self, photo: usize, pose: &Rigid) -> (f64, f64) {
         let truth = &self.photos[photo].pose;
         ((pose.translation - truth.translation).norm(), pose.rotation.angle_to(&truth.rotation).to_degrees())
     }
 
     /// How many features of a photo show a point of the scene.
-    pub(crate) fn shared_with_scene(&self, photo: usize) -> usize {
+    pub fn shared_with_scene(&self, photo: usize) -> usize {
         let shows = self.photos[photo].shows.iter().flatten();
         shows.filter(|point| self.scene_points.binary_search(point).is_ok()).count()
     }
