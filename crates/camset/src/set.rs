@@ -103,21 +103,21 @@ fn better_of(first: Answer, second: Answer) -> Answer {
         let apart = (of_a.translation - of_b.translation).norm();
         is_localized(a) && is_localized(b) && apart > MAX_APART * sigma(a).hypot(sigma(b))
     };
-    let gains = pairs().any(|(a, b)| rank(b.verdict) > rank(a.verdict));
+    let gains = pairs().any(|(a, b)| b.verdict.rank() > a.verdict.rank());
     if !gains || pairs().any(contradicts) {
         return first;
     }
     let mut best = second;
     let Answer { set: first, elsewhere, .. } = first;
     for (at, refined) in first.refined.into_iter().enumerate() {
-        if rank(refined.verdict) > rank(best.set.refined[at].verdict) {
+        if refined.verdict.rank() > best.set.refined[at].verdict.rank() {
             best.set.refined[at] = refined;
             best.set.paths[at] = first.paths[at].clone();
             best.elsewhere[at] = elsewhere[at];
         }
     }
     for (kept, rigid) in best.set.rigid.iter_mut().zip(first.rigid) {
-        if rank(rigid.verdict) > rank(kept.verdict) {
+        if rigid.verdict.rank() > kept.verdict.rank() {
             *kept = rigid;
         }
     }
@@ -260,17 +260,9 @@ fn shared_points(model: &Reconstruction) -> BTreeMap<(usize, usize), usize> {
     shared
 }
 
-fn rank(verdict: Verdict) -> u8 {
-    match verdict {
-        Verdict::Localized => 2,
-        Verdict::Uncertain => 1,
-        Verdict::NotLocalized => 0,
-    }
-}
-
 /// Whether the other was better.
 fn keep_better(kept: &mut Option<PhotoLocalization>, other: PhotoLocalization) -> bool {
-    let is_better = kept.as_ref().is_none_or(|kept| rank(other.verdict) > rank(kept.verdict));
+    let is_better = kept.as_ref().is_none_or(|kept| other.verdict.rank() > kept.verdict.rank());
     if is_better {
         *kept = Some(other);
     }

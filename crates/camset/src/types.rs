@@ -41,6 +41,15 @@ pub enum Verdict {
 }
 
 impl Verdict {
+    /// The better, the higher.
+    pub fn rank(self) -> u8 {
+        match self {
+            Self::Localized => 2,
+            Self::Uncertain => 1,
+            Self::NotLocalized => 0,
+        }
+    }
+
     /// As people say it.
     pub fn in_words(self) -> &'static str {
         match self {

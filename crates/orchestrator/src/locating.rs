@@ -55,20 +55,12 @@ impl Located {
         let single = self.single.iter().filter(|photo| !contradicted(photo)).map(|p| ("single", p));
         let mut best: BTreeMap<&str, (&'static str, &PhotoLocalization)> = BTreeMap::new();
         for (method, photo) in single.chain(rigid).chain(refined) {
-            let better = |old: &PhotoLocalization| rank(photo.verdict) >= rank(old.verdict);
+            let better = |old: &PhotoLocalization| photo.verdict.rank() >= old.verdict.rank();
             if best.get(photo.name.as_str()).is_none_or(|(_, old)| better(old)) {
                 best.insert(&photo.name, (method, photo));
             }
         }
         best.into_values().collect()
-    }
-}
-
-fn rank(verdict: Verdict) -> u8 {
-    match verdict {
-        Verdict::Localized => 2,
-        Verdict::Uncertain => 1,
-        Verdict::NotLocalized => 0,
     }
 }
 

@@ -81,11 +81,8 @@ pub fn georegister(
     let residuals = pairs
         .iter()
         .map(|pair| {
-            let mut offset = best.transform_point(&pair.center) - pair.measured.enu;
-            if !pair.measured.has_height {
-                offset.z = 0.0;
-            }
-            (pair.image, offset.norm(), alignment.error(&best, pair) <= params.max_error_sigma)
+            let agrees = alignment.error(&best, pair) <= params.max_error_sigma;
+            (pair.image, pair.offset(&best).norm(), agrees)
         })
         .collect();
     Some(Georegistration { enu_from_world: best, residuals })
@@ -98,6 +95,17 @@ struct Pair {
     measured: MeasuredPosition,
 }
 
+impl Pair {
+    /// From the measurement to the centre, as far as was measured.
+    fn offset(&self, similarity: &Similarity) -> Vector3<f64> {
+        let mut offset = similarity.transform_point(&self.center) - self.measured.enu;
+        if !self.measured.has_height {
+            offset.z = 0.0;
+        }
+        offset
+    }
+}
+
 struct Alignment<'a> {
     params: &'a GeoregisterParams,
     pairs: &'a [Pair],
@@ -106,8 +114,8 @@ struct Alignment<'a> {
 impl Alignment<'_> {
     /// In standard deviations.
     fn error(&self, similarity: &Similarity, pair: &Pair) -> f64 {
-        let mut offset = similarity.transform_point(&pair.center) - pair.measured.enu;
-        offset.z *= if pair.measured.has_height { self.params.height_factor.recip() } else { 0.0 };
+        let mut offset = pair.offset(similarity);
+        offset.z *= self.params.height_factor.recip();
         offset.norm() / self.params.gps_sigma_m
     }
 

@@ -54,6 +54,13 @@ pub struct PairDisagreement {
     pub rotation_deg: f64,
 }
 
+impl PairDisagreement {
+    /// Whether next to nothing of what the pair shares became points of the model.
+    fn is_unused(&self) -> bool {
+        self.used * 5 < self.matches
+    }
+}
+
 /// Two cameras that stand together in the model but hardly share what both ought to see: the sign of a fold.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SuspiciousNeighbours {
@@ -178,7 +185,7 @@ pub fn assess(
                 .to_degrees(),
         };
         let is_turned = found.rotation_deg > params.max_rotation_deg && two_view.kind == TwoViewKind::General;
-        let agrees = used * 5 >= found.matches && !is_turned;
+        let agrees = !found.is_unused() && !is_turned;
         let (kept, any_agrees) =
             judged.entry((pair.first, pair.second)).or_insert_with(|| (found.clone(), false));
         *any_agrees |= agrees;
@@ -231,9 +238,9 @@ impl QualityReport {
         for (image, points) in &self.weak_images {
             lines.push(format!("{} is held by {points} points only", name(*image)));
         }
-        let is_loud = |pair: &&PairDisagreement| pair.used * 5 < pair.matches && pair.matches >= LOUD_MATCHES;
+        let is_loud = |pair: &PairDisagreement| pair.is_unused() && pair.matches >= LOUD_MATCHES;
         let many = self.disagreements.len() as f64 >= LOUD_SHARE * self.pairs as f64;
-        if !self.disagreements.is_empty() && (many || self.disagreements.iter().any(|pair| is_loud(&pair))) {
+        if !self.disagreements.is_empty() && (many || self.disagreements.iter().any(is_loud)) {
             let mut worst: Vec<&PairDisagreement> = self.disagreements.iter().collect();
             worst.sort_by_key(|pair| std::cmp::Reverse(pair.matches));
             let named: Vec<String> = worst
@@ -241,7 +248,7 @@ impl QualityReport {
                 .take(MOST_NAMED)
                 .map(|pair| {
                     let PairDisagreement { matches, used, rotation_deg, .. } = **pair;
-                    let how = if used * 5 < matches {
+                    let how = if pair.is_unused() {
                         format!("{used} of {matches} matches used")
                     } else {
                         format!("{matches} matches, turned by {rotation_deg:.0}°")

@@ -247,7 +247,8 @@ impl Component<'_> {
             reasons.push(format!("its scale rests on {elsewhere} matches seen from elsewhere than the rest"));
             support = weaker(support, Verdict::Uncertain);
         }
-        let mut refined = self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
+        let (mut refined, elsewhere_alone) =
+            self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
         let mut without_scale = Vec::new();
         if has_scale
             && elsewhere.max(joint.seen_from_elsewhere()).max(joint.viewed_from_elsewhere) < MIN_FOR_SCALE
@@ -288,12 +289,9 @@ impl Component<'_> {
                 .zip(&joint.viewed)
                 .map(|(direct, viewed)| direct.len() + viewed)
                 .collect(),
-            elsewhere: (0..self.members.len())
-                .map(|slot| {
-                    let has_pose = refined[slot].world_from_camera.is_some();
-                    let depth = self.depth(&joint, slot);
-                    has_pose && self.seen_alone(&joint.model.photos, slot, depth) == Some(false)
-                })
+            // Without a pose there is nothing to contradict.
+            elsewhere: (refined.iter().zip(elsewhere_alone))
+                .map(|(photo, elsewhere)| elsewhere && photo.world_from_camera.is_some())
                 .collect(),
             refined,
             remarks,
@@ -819,6 +817,7 @@ impl Component<'_> {
             .collect()
     }
 
+    /// The answers, and whether each photo stands elsewhere when localized alone.
     fn refined_answers(
         &self,
         candidates: &[SetCorrespondence],
@@ -826,7 +825,7 @@ impl Component<'_> {
         joint: &Joint,
         support: Verdict,
         reasons: &[String],
-    ) -> Vec<PhotoLocalization> {
+    ) -> (Vec<PhotoLocalization>, Vec<bool>) {
         let kept = rigid.agreeing.iter().filter(|&&number| {
             let candidate = &candidates[number];
             let seen = |&(slot, feature): &(usize, u32)| {
@@ -853,7 +852,8 @@ impl Component<'_> {
                     ));
                     verdict = weaker(verdict, Verdict::Uncertain);
                 }
-                match self.seen_alone(&joint.model.photos, slot, depth) {
+                let seen_alone = self.seen_alone(&joint.model.photos, slot, depth);
+                match seen_alone {
                     // The photos' own matches are evidence that the set's pose did not create.
                     Some(true) => {
                         reasons.push("localized alone, it stands at the same place".to_owned());
@@ -870,7 +870,7 @@ impl Component<'_> {
                 let lengths = self.lengths().filter(|&([.., to], _)| of_standpoint(to));
                 reasons.extend(lengths.map(|(slots, length)| self.basis(slots, &length)));
                 let verdict = weaker(verdict, precision);
-                PhotoLocalization {
+                let answer = PhotoLocalization {
                     name: self.photos[photo].name.to_owned(),
                     camera: joint.model.cameras[self.camera_of(slot)].clone(),
                     world_from_camera: Some(pose),
@@ -878,9 +878,10 @@ impl Component<'_> {
                     inliers: joint.direct[slot].len() + joint.viewed[slot],
                     verdict,
                     reasons,
-                }
+                };
+                (answer, seen_alone == Some(false))
             })
-            .collect()
+            .unzip()
     }
 
     /// Whether the photo, or another of its standpoint, stands at the same place when localized alone; `None` when

@@ -50,7 +50,7 @@ impl fmt::Display for Range {
     }
 }
 
-/// Keys, or their ends, with the values allowed; the first that fits counts.
+/// Keys, or their ends, with the values allowed; the longest that fits counts.
 const RANGES: &[(&str, Range)] = &[
     ("features.max_features", Range::Within(1.0, 1e6)),
     ("features.max_side", Range::Within(32.0, 32_768.0)),

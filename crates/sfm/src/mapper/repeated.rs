@@ -77,8 +77,8 @@ pub(super) struct Underfoot<'a> {
     input: &'a MapperInput<'a>,
     /// Of panoramas that see all around.
     rays: Vec<Option<Rays>>,
-    /// Whether each pair of the input explains what lies underfoot and nothing else.
-    is_one_sided: Vec<bool>,
+    /// Pairs of the input that explain what lies underfoot and nothing else.
+    one_sided: Vec<&'a PairGeometry>,
     /// Where each image sees that, of any length.
     poles: Vec<Vector3<f64>>,
 }
@@ -95,14 +95,14 @@ impl<'a> Underfoot<'a> {
             .collect();
         let matches: BTreeMap<(ImageId, ImageId), &[Match]> =
             input.putative.iter().map(|pair| ((pair.first, pair.second), &pair.matches[..])).collect();
-        let is_one_sided: Vec<bool> = (input.pairs.par_iter().with_max_len(8))
-            .map(|pair| {
+        let one_sided: Vec<&PairGeometry> = (input.pairs.par_iter().with_max_len(8))
+            .filter(|pair| {
                 let all = matches.get(&(pair.first, pair.second)).copied().unwrap_or_default();
                 both(&rays, pair.first, pair.second).is_some_and(|rays| is_one_sided(rays, pair, all))
             })
             .collect();
         let mut poles = vec![Vector3::zeros(); rays.len()];
-        for (pair, _) in input.pairs.iter().zip(&is_one_sided).filter(|(_, is_one_sided)| **is_one_sided) {
+        for pair in &one_sided {
             for m in &pair.two_view.inliers {
                 for (image, feature) in [(pair.first, m.first), (pair.second, m.second)] {
                     if let Some(rays) = &rays[image.index()] {
@@ -111,7 +111,7 @@ impl<'a> Underfoot<'a> {
                 }
             }
         }
-        is_one_sided.contains(&true).then_some(Self { input, rays, is_one_sided, poles })
+        (!one_sided.is_empty()).then_some(Self { input, rays, one_sided, poles })
     }
 
     /// What the model ought to be made of in place of all, and what to say of it; `None` where nothing speaks against
@@ -129,7 +129,7 @@ impl<'a> Underfoot<'a> {
                 return Some((rest, WARNING.to_owned()));
             }
         }
-        agreement(self.one_sided(), components).filter(|share| *share < MIN_AGREEMENT)?;
+        agreement(self.one_sided.iter().copied(), components).filter(|share| *share < MIN_AGREEMENT)?;
         let held = self.held_underfoot(components);
         if held.is_empty() {
             return None;
@@ -142,15 +142,10 @@ impl<'a> Underfoot<'a> {
         Some((self.left_out(|image| held.contains(&image), seed), warning))
     }
 
-    fn one_sided(&self) -> impl Iterator<Item = &PairGeometry> {
-        let numbered = self.input.pairs.iter().zip(&self.is_one_sided);
-        numbered.filter(|(_, is_one_sided)| **is_one_sided).map(|(pair, _)| pair)
-    }
-
     /// Share of all verified matches that lie in one-sided geometries.
     fn share(&self) -> f64 {
         let all: usize = self.input.pairs.iter().map(|pair| pair.two_view.inliers.len()).sum();
-        let count: usize = self.one_sided().map(|pair| pair.two_view.inliers.len()).sum();
+        let count: usize = self.one_sided.iter().map(|pair| pair.two_view.inliers.len()).sum();
         count as f64 / all.max(1) as f64
     }
 
