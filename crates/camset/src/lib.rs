@@ -12,7 +12,9 @@
 //! It knows no files and no features beyond those handed in, and it builds no local models.
 
 mod advice;
+mod common;
 mod evidence;
+mod grow;
 mod guided;
 mod jackknife;
 mod observability;
@@ -26,11 +28,13 @@ mod verdict;
 mod views;
 
 pub use advice::{Link, PathToScene};
+pub use grow::{GrownScene, Growth, GrowthParams, GrowthPhoto, GrowthPoint, grow};
 pub use params::{CamsetMethod, CamsetParams, GuidedParams, SingleParams, VerdictParams};
 pub use set::locate_set;
 pub use single::locate_single;
 pub use types::{
-    PhotoLocalization, QueryPhoto, Scene, SceneMatch, SetLocalization, SingleLocalization, Verdict,
+    GrownImage, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SetLocalization, SingleLocalization,
+    Verdict,
 };
 pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match_views};
 
@@ -45,3 +49,6 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 15: only matches hundreds of deviations off are no noise. 16: what points do not localize is matched with the scene's
 /// images. 17, 18: by fewer matches a pair, all photos alike. 19: contradictions are named, advice goes with the answers.
 pub const VERSION: u32 = 19;
+
+/// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
+pub const GROWTH_VERSION: u32 = 1;

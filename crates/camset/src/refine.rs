@@ -11,6 +11,7 @@ use setloc_sfm::bundle::{
 };
 use setloc_sfm::{ImageId, Place, PointId, Rigid};
 
+use crate::common::{CommonErrors, PoseError, shift_of_point};
 use crate::evidence::{PhotoRays, ray_error_sigmas};
 use crate::jackknife::honest_covariances;
 use crate::{Scene, SceneMatch};
@@ -100,7 +101,6 @@ pub(crate) fn refine_jointly(
     observed: &JointObservations,
     with_covariance: bool,
 ) -> Vec<Option<Matrix6<f64>>> {
-    let Scene { reconstruction: scene, index } = *scene;
     let standpoints = Standpoints::new(&model.photos);
     let mut builder = Builder {
         points: model.points.iter().map(|&position| BundlePoint { position, fixed: false }).collect(),
@@ -113,7 +113,7 @@ pub(crate) fn refine_jointly(
         standpoints: &standpoints,
         rays,
     };
-    builder.add_all(index, observed);
+    builder.add_all(scene.index, observed);
     let Builder { points, mut observations, mut origins, support, seen, priors, .. } = builder;
     let camera_freedom = support
         .iter()
@@ -139,10 +139,13 @@ pub(crate) fn refine_jointly(
         .collect();
     let mut cameras = model.cameras.clone();
     cameras.push(sphere());
-    for &(point, ref covariance) in &priors {
+    let mut common = CommonErrors::default();
+    for &ScenePrior { point, scene_point, ref covariance } in &priors {
+        let shift = shift_of_point(scene, scene_point);
         for prior in prior_bearings(&points[point as usize].position, covariance) {
             let pose = poses.len() as u32;
             let camera = model.cameras.len() as u32;
+            common.far.extend(shift.map(|shift| (pose, shift)));
             poses.push(BundlePose { camera, world_from_camera: prior.world_from_camera, fixed: true });
             let PriorBearing { pixel, noise_px, .. } = prior;
             observations.push(BundleObservation { pose, point, pixel, noise_px });
@@ -151,13 +154,21 @@ pub(crate) fn refine_jointly(
     }
     let mut pose_of_view: BTreeMap<ImageId, u32> = BTreeMap::new();
     for (point, view) in &observed.views {
-        let Some(world_from_camera) = scene.images[view.image.index()].world_from_camera else { continue };
+        let seen_by = &scene.reconstruction.images[view.image.index()];
+        let Some(world_from_camera) = seen_by.world_from_camera else { continue };
+        let camera = scene.reconstruction.camera_of(view.image);
+        let error = PoseError::of_image(scene, view.image);
         let pose = *pose_of_view.entry(view.image).or_insert_with(|| {
+            let pose = poses.len() as u32;
             poses.push(BundlePose { camera: cameras.len() as u32, world_from_camera, fixed: true });
-            cameras.push(scene.camera_of(view.image).clone());
-            poses.len() as u32 - 1
+            cameras.push(camera.clone());
+            common.views.extend(error.map(|error| (pose, error)));
+            pose
         });
-        let Place { pixel, noise_px } = view.place;
+        let Place { pixel, mut noise_px } = view.place;
+        if let (Some(error), Some(angle)) = (error, camera.pixel_angle(&pixel)) {
+            noise_px = noise_px.hypot(error.angular_sigma(&points[*point].position) / angle);
+        }
         observations.push(BundleObservation { pose, point: *point as u32, pixel, noise_px });
         origins.push(Origin::Scene);
     }
@@ -177,6 +188,11 @@ pub(crate) fn refine_jointly(
         of_leads = honest_covariances(&params, &mut problem, photos, |problem, loss| {
             covariances(problem, photos, loss)
         });
+        for (covariance, common) in
+            of_leads.iter_mut().zip(common.spread(&params, &problem, photos).unwrap_or_default())
+        {
+            *covariance = covariance.map(|own| own + common);
+        }
     }
     for (camera, refined) in model.cameras.iter_mut().zip(&problem.cameras) {
         camera.clone_from(refined);
@@ -205,6 +221,13 @@ enum Origin {
     Far,
 }
 
+/// A point of a bundle problem that is a scene point, and what the scene knows of it.
+struct ScenePrior {
+    point: u32,
+    scene_point: PointId,
+    covariance: Matrix3<f64>,
+}
+
 /// Collects the points and observations of a bundle problem.
 struct Builder<'a> {
     points: Vec<BundlePoint>,
@@ -214,8 +237,7 @@ struct Builder<'a> {
     support: Vec<usize>,
     /// Observations of each photo's standpoint.
     seen: Vec<usize>,
-    /// Scene points, and what is known of them.
-    priors: Vec<(u32, Matrix3<f64>)>,
+    priors: Vec<ScenePrior>,
     photos: &'a [JointPhoto],
     standpoints: &'a Standpoints,
     rays: &'a [PhotoRays<'a>],
@@ -225,8 +247,7 @@ impl Builder<'_> {
     fn add_all(&mut self, index: &SceneIndex, observed: &JointObservations) {
         let mut held = BTreeSet::new();
         for tied in &observed.tied {
-            let covariance = index.position_covariance(tied.scene) + tied.spot;
-            let point = self.add_scene_point(index.position(tied.scene), covariance);
+            let point = self.add_scene_point(index, tied.scene, &tied.spot);
             for seen in &tied.seen {
                 self.observe(seen.photo, &seen.place, point, Origin::Local);
                 held.extend(seen.feature.map(|feature| (seen.photo, feature)));
@@ -235,9 +256,9 @@ impl Builder<'_> {
         let mut scene_points: BTreeMap<PointId, u32> = BTreeMap::new();
         for (slot, matches) in observed.direct.iter().enumerate() {
             for found in matches.iter().filter(|found| !held.contains(&(slot, found.feature))) {
-                let point = *scene_points.entry(found.point).or_insert_with(|| {
-                    self.add_scene_point(index.position(found.point), index.position_covariance(found.point))
-                });
+                let point = *scene_points
+                    .entry(found.point)
+                    .or_insert_with(|| self.add_scene_point(index, found.point, &Matrix3::zeros()));
                 self.observe(slot, &self.rays[slot].place_of(found.feature), point, Origin::Scene);
             }
         }
@@ -246,13 +267,16 @@ impl Builder<'_> {
         }
     }
 
-    fn add_scene_point(&mut self, position: Vector3<f64>, covariance: Matrix3<f64>) -> u32 {
+    /// `spot` is what else is uncertain of the place that is observed.
+    fn add_scene_point(&mut self, index: &SceneIndex, scene_point: PointId, spot: &Matrix3<f64>) -> u32 {
+        let (position, covariance) =
+            (index.position(scene_point), index.position_covariance(scene_point) + spot);
         let point = self.points.len() as u32;
         // An exact point has no bearings that hold it.
         let fixed = covariance == Matrix3::zeros();
         self.points.push(BundlePoint { position, fixed });
         if !fixed {
-            self.priors.push((point, covariance));
+            self.priors.push(ScenePrior { point, scene_point, covariance });
         }
         point
     }

@@ -141,6 +141,8 @@ fn model_of(place: &Place, views: &[View], camera: &Camera) -> (Reconstruction, 
 
 /// Panoramas, their model and index; a chain of photos and their local model.
 pub struct World {
+    /// Positions of the place's points.
+    positions: Vec<Vector3<f64>>,
     /// Which point of the place each scene point is.
     scene_points: Vec<usize>,
     panoramas: Vec<View>,
@@ -220,7 +222,8 @@ impl World {
         let (mut local, _) = model_of(place, &photos, &camera);
         local.transform(&world_from_set.inverse());
         let names = (0..photos.len()).map(|i| format!("photo_{i:02}")).collect();
-        Self { scene_points, panoramas, scene_model, index, camera, photos, names, local }
+        let positions = place.positions.clone();
+        Self { positions, scene_points, panoramas, scene_model, index, camera, photos, names, local }
     }
 
     /// Bends the local model: each photo, with the points it is the first to see, is turned by `angle` and stretched
@@ -370,7 +373,7 @@ impl World {
 
     /// The panoramas' model and its index.
     pub fn scene(&self) -> Scene<'_> {
-        Scene { reconstruction: &self.scene_model, index: &self.index }
+        Scene { reconstruction: &self.scene_model, index: &self.index, grown: &[] }
     }
 
     /// The photos, intrinsics known.
@@ -395,7 +398,16 @@ impl World {
 
     /// How many features of a photo show a point of the scene.
     pub fn shared_with_scene(&self, photo: usize) -> usize {
-        let shows = self.photos[photo].shows.iter().flatten();
-        shows.filter(|point| self.scene_points.binary_search(point).is_ok()).count()
+        self.photos[photo].shows.iter().flatten().filter(|point| self.knows(**point)).count()
+    }
+
+    /// Whether a point of the place is one of the scene.
+    pub fn knows(&self, point: usize) -> bool {
+        self.scene_points.binary_search(&point).is_ok()
+    }
+
+    /// Where a point of the place is.
+    pub fn position(&self, point: usize) -> Vector3<f64> {
+        self.positions[point]
     }
 }

@@ -2,7 +2,7 @@ use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, ImageFeatures};
 use setloc_index::{NearestPoints, SceneIndex};
-use setloc_sfm::{PointId, Reconstruction, Rigid, Similarity};
+use setloc_sfm::{ImageId, PointId, Reconstruction, Rigid, Similarity};
 
 use crate::PathToScene;
 
@@ -13,6 +13,19 @@ pub struct Scene<'a> {
     pub reconstruction: &'a Reconstruction,
     /// Its searchable descriptors.
     pub index: &'a SceneIndex,
+    /// Which of its images are photos that it has grown by; ascending, and after all others.
+    pub grown: &'a [GrownImage],
+}
+
+/// An image of the scene that is a photo localized in the scene as it was before.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct GrownImage {
+    /// The image.
+    pub image: ImageId,
+    /// Covariance of its pose, as that of a [`PhotoLocalization`].
+    pub covariance: Matrix6<f64>,
+    /// Median distance of the scene points that it sees, in scene units.
+    pub depth: f64,
 }
 
 /// One photo to localize.

@@ -20,7 +20,7 @@ pub use kernel::squared_distances;
 pub use matching::{Correspondence, LocalDescriptors, PointCorrespondence};
 pub use nearest::{NearestPoints, Neighbour};
 pub use params::{Backend, IndexParams};
-pub use scene_index::{Row, SceneIndex};
+pub use scene_index::{IndexGrowth, Row, SceneIndex};
 
 /// Version of the index's contents; bumped whenever equal inputs give another index.
 ///

@@ -160,7 +160,7 @@ impl SceneIndex {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
+    use nalgebra::{Matrix3, Vector3};
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
     use setloc_features::{Camera, DESCRIPTOR_LEN, Keypoint, squared_distance};
@@ -169,7 +169,7 @@ mod tests {
     };
 
     use super::*;
-    use crate::{Backend, IndexParams, Neighbour};
+    use crate::{Backend, IndexGrowth, IndexParams, Neighbour, Row};
 
     /// Descriptors in clusters, as real ones are, with `noise` between observations of one point.
     fn descriptor(rng: &mut ChaCha8Rng, center: &[u8], noise: i16) -> Vec<u8> {
@@ -248,6 +248,44 @@ mod tests {
         all.sort_unstable();
         let neighbour = |i: usize| Some(Neighbour { point: PointId(all[i].1), distance2: all[i].0 });
         NearestPoints { first: neighbour(0), second: neighbour(1) }
+    }
+
+    #[test]
+    fn an_extended_index_finds_what_one_of_everything_does() {
+        let (whole, features, truth) = scene(300, 3, 8);
+        let first = ImageId(2);
+        let mut part = whole.clone();
+        part.images.truncate(first.index());
+        part.points.truncate(200);
+        part.points.iter_mut().for_each(|point| point.track.retain(|seen| seen.image < first));
+        let extent = 0.5;
+        let mut rows = Vec::new();
+        for (id, point) in (0..).map(PointId).zip(&whole.points) {
+            let new = point.track.iter().filter(|seen| id.index() >= 200 || seen.image >= first);
+            rows.extend(new.map(|&Observation { image, feature }| {
+                let descriptor = features[image.index()].descriptor(feature as usize);
+                (Row { point: id, image, extent }, descriptor)
+            }));
+        }
+        let points: Vec<_> = whole.points[200..].iter().map(|p| (p.position, Matrix3::identity())).collect();
+        let growth = IndexGrowth { centers: &[Some(Vector3::x())], points: &points, rows: &rows };
+        for backend in [Backend::Exact, Backend::Inverted] {
+            let params = IndexParams { backend, ..Default::default() };
+            let extended = build(backend, &part, &features[..2]).extended(&params, &growth);
+            let full = build(Backend::Exact, &whole, &features);
+            assert_eq!((extended.backend(), extended.point_count()), (backend, 300));
+            assert_eq!(extended.descriptor_count(), full.descriptor_count());
+            assert_eq!(extended.center(first), Some(Vector3::x()));
+            assert_eq!(extended.position_covariance(PointId(299)), Matrix3::identity());
+            let queries = truth.concat();
+            let pairs = extended.nearest_points(&queries).into_iter().zip(full.nearest_points(&queries));
+            let equal = pairs.filter(|(found, wanted)| found.first == wanted.first).count();
+            assert!(equal >= 290, "{backend:?}: {equal}");
+        }
+        let unknown = [(Row { point: PointId(300), image: first, extent }, features[0].descriptor(0))];
+        let nothing = IndexGrowth { rows: &unknown, ..IndexGrowth::default() };
+        let index = build(Backend::Exact, &part, &features[..2]);
+        assert_eq!(index.extended(&IndexParams::default(), &nothing), index);
     }
 
     #[test]

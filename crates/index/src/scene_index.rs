@@ -29,6 +29,17 @@ pub struct Row {
     pub extent: f32,
 }
 
+/// What an index grows by; see [`SceneIndex::extended`].
+#[derive(Debug, Clone, Copy, Default)]
+pub struct IndexGrowth<'a> {
+    /// Camera centres of the further images, in the scene's frame; their ids follow those of the others.
+    pub centers: &'a [Option<Vector3<f64>>],
+    /// Positions of the further points and their covariances; their ids follow those of the others.
+    pub points: &'a [(Vector3<f64>, Matrix3<f32>)],
+    /// Further observations with their descriptors.
+    pub rows: &'a [(Row, &'a [u8])],
+}
+
 /// Searchable descriptors of a scene; self-contained (needs no features once built).
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SceneIndex {
@@ -75,6 +86,36 @@ impl SceneIndex {
                 .collect(),
             descriptors: descriptors_of(rows.len(), descriptor),
             rows: rows.into_iter().map(|(row, _)| row).collect(),
+            ..Self::default()
+        };
+        index.prepare_search(params);
+        index.group_rows_by_point();
+        index
+    }
+
+    /// The index of a scene that has grown: further images, points and observations behind those that it has.
+    ///
+    /// Points that it has stay where they are. Observations of points that neither has are left out.
+    #[must_use]
+    pub fn extended(&self, params: &IndexParams, growth: &IndexGrowth<'_>) -> Self {
+        let positions: Vec<Vector3<f64>> = self
+            .positions
+            .iter()
+            .copied()
+            .chain(growth.points.iter().map(|(position, _)| *position))
+            .collect();
+        let known = |(row, descriptor): &&(Row, &[u8])| {
+            row.point.index() < positions.len() && descriptor.len() == DESCRIPTOR_LEN
+        };
+        let new: Vec<&(Row, &[u8])> = growth.rows.iter().filter(known).collect();
+        let new_descriptors: Vec<&[u8]> = new.iter().map(|(_, descriptor)| *descriptor).collect();
+        let mut index = Self {
+            covariances: [&self.covariances[..], &growth.points.iter().map(|(_, c)| *c).collect::<Vec<_>>()]
+                .concat(),
+            centers: [&self.centers[..], growth.centers].concat(),
+            rows: self.rows.iter().copied().chain(new.iter().map(|(row, _)| *row)).collect(),
+            descriptors: [&self.descriptors[..], &new_descriptors.concat()].concat(),
+            positions,
             ..Self::default()
         };
         index.prepare_search(params);

@@ -13,6 +13,7 @@ use setloc_sfm::{ImageId, Observation, Place, Rigid, Similarity};
 use self::lone::LoneSight;
 use super::rigid::solver_options;
 use super::scale::{About, most_voted};
+use crate::common::PoseError;
 use crate::evidence::{PhotoRays, log10_false_alarms, median, ray_error_sigmas};
 use crate::observability::SetRay;
 use crate::{CamsetParams, Scene, ViewGeometry, Views};
@@ -69,6 +70,16 @@ pub(crate) struct Sights {
     putative: usize,
 }
 
+/// Standard deviation of a direction for the pose of the scene image that sees it, at the distance of most that it sees; in
+/// radians, and 0 where the pose is taken as exact.
+fn pose_sigma(scene: &Scene<'_>, image: ImageId, direction: &Vector3<f64>) -> f64 {
+    let grown = scene.grown.binary_search_by_key(&image, |grown| grown.image).ok().map(|at| &scene.grown[at]);
+    let center = scene.reconstruction.images[image.index()].world_from_camera.map(|pose| pose.translation);
+    let (Some(grown), Some(center)) = (grown, center) else { return 0.0 };
+    let error = PoseError::of_image(scene, image);
+    error.map_or(0.0, |error| error.angular_sigma(&(center + direction * grown.depth)))
+}
+
 /// Largest standard deviation of a local point, as a share of its distance, that counts as a point.
 const MAX_POINT_SIGMA: f64 = 0.1;
 /// Samples that the pose from the scene's side may cost.
@@ -120,10 +131,11 @@ impl Sights {
             let features = views.features.get(seen.image.index())?.as_ref()?;
             let keypoint = features.keypoints.get(seen.feature as usize)?;
             let (bearing, angle) = camera.ray(&keypoint.pixel())?;
+            let direction = pose.rotation * bearing;
             let ray = GeneralizedRay {
                 origin: pose.translation,
-                direction: pose.rotation * bearing,
-                sigma: angle * f64::from(keypoint.noise_px),
+                direction,
+                sigma: pose_sigma(scene, seen.image, &direction).hypot(angle * f64::from(keypoint.noise_px)),
                 camera: seen.image.0,
             };
             Some((ray, Place::from(keypoint)))

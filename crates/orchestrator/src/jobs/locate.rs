@@ -151,5 +151,5 @@ fn query<'a>(photo: &'a SourceImage, features: &'a ImageFeatures) -> QueryPhoto<
 }
 
 fn scene_of<'a>(scene: &'a SceneFile, empty: &'a Reconstruction) -> Scene<'a> {
-    Scene { reconstruction: scene.main().unwrap_or(empty), index: &scene.index }
+    Scene { reconstruction: scene.main().unwrap_or(empty), index: &scene.index, grown: &[] }
 }
