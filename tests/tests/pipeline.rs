@@ -6,8 +6,13 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use setloc_camset::{PhotoLocalization, Verdict};
 use setloc_orchestrator::bench::{BenchGps, BenchOptions, DatasetFigures, bench_dataset};
+use setloc_orchestrator::building::{BuildOutcome, build_scene};
 use setloc_orchestrator::config::Config;
+use setloc_orchestrator::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
+use setloc_orchestrator::jobs::LocateJobs;
+use setloc_orchestrator::locating::{Mode, grow, locate};
 use setloc_orchestrator::session::{Limits, Session};
 use setloc_orchestrator::stages;
 use setloc_town::{TownParams, write_dataset};
@@ -55,6 +60,58 @@ fn the_town_is_mapped_and_its_set_located() {
     let figures = bench(folder.path());
     assert!(!figures.sets.is_empty());
     assert_main_job(&figures);
+}
+
+#[test]
+fn photos_localized_earlier_localize_one_that_the_panoramas_do_not() {
+    let folder = tempfile::tempdir().unwrap();
+    stages::write_sample(folder.path()).unwrap();
+    let limits = Limits { threads: 2, memory: 4 << 30 };
+    let store = folder.path().join("store");
+    let session = Session::open(&store, None, limits, Arc::new(AtomicBool::new(false))).unwrap();
+    let cameras = CameraBook::read(&folder.path().join("cameras.json")).unwrap();
+    let read = |part: &str| {
+        let files = list_images(&[folder.path().join(part)]).unwrap();
+        ImageFolder::read(&files, &cameras, &GeoSource::None, None).unwrap()
+    };
+    let config = Config::default();
+    let panoramas = read("panoramas");
+    let BuildOutcome::Built(built) =
+        build_scene(&session, &panoramas, &config, 0, "scene", None, |_| Ok(())).unwrap()
+    else {
+        panic!("no present hash was given")
+    };
+    let mut bridging = read("queries/lane");
+    // The last one stands too far on for those before it, too.
+    bridging.images.pop();
+    let target =
+        ImageFolder { images: bridging.images.pop().into_iter().collect(), ..ImageFolder::default() };
+    let name = target.images[0].name.clone();
+    let alone = |scene| {
+        let what = LocateJobs { scene, config: config.clone(), seed: 0 };
+        locate(&session, &target, &what, Mode::Single, "alone", &name).unwrap().single[0].clone()
+    };
+    assert_ne!(alone(Arc::clone(&built.scene)).verdict, Verdict::Localized);
+
+    let what = LocateJobs { scene: Arc::clone(&built.scene), config: config.clone(), seed: 0 };
+    let last = bridging.images.last().unwrap().name.clone();
+    let located = locate(&session, &bridging, &what, Mode::Both, "set", &last).unwrap();
+    let grown = grow(&session, &bridging, &what, ("grow", &last), &located).unwrap().unwrap();
+    assert_eq!(grown.scene.grown.len(), bridging.images.len());
+    assert_ne!(grown.scene.content, built.scene.content);
+    let found = alone(Arc::clone(&grown.scene));
+    assert_eq!(found.verdict, Verdict::Localized, "{:?}", found.reasons);
+
+    // With its set, in the scene as it was, it stands at the same place.
+    bridging.images.extend(target.images.clone());
+    let by_set = locate(&session, &bridging, &what, Mode::Set, "whole", &name).unwrap().set.unwrap();
+    let by_set = by_set.refined.iter().find(|photo| photo.name == name).unwrap();
+    let pose = |photo: &PhotoLocalization| photo.world_from_camera.unwrap();
+    let apart = (pose(&found).translation - pose(by_set).translation).norm();
+    let baseline = (pose(&found).translation
+        - grown.scene.main().unwrap().images[0].world_from_camera.unwrap().translation)
+        .norm();
+    assert!(apart < 0.01 * baseline, "{apart} of {baseline}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! What the jobs hand on, as files.
 
 use serde::{Deserialize, Serialize};
-use setloc_camset::{SetLocalization, SingleLocalization};
+use setloc_camset::{Growth, SetLocalization, SingleLocalization};
 use setloc_features::{ImageFeatures, Keypoint, Match, SimulatedView};
 use setloc_index::SceneIndex;
 use setloc_sfm::{MapperOutput, TwoView};
@@ -114,4 +114,5 @@ serde_artifact!(VerifiedPair, "verified pair", 1);
 serde_artifact!(MapperOutput, "model", 5);
 serde_artifact!(SceneIndex, "index", 1);
 serde_artifact!(SingleLocalization, "photo localization", 2);
+serde_artifact!(Growth, "growth", 1);
 serde_artifact!(SetLocalization, "set localization", 2);

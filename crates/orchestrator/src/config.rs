@@ -6,7 +6,7 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
-use setloc_camset::{CamsetParams, SingleParams};
+use setloc_camset::{CamsetParams, GrowthParams, SingleParams};
 use setloc_index::IndexParams;
 use setloc_sfm::{AlignmentParams, GeoregisterParams, MapperParams, QualityParams, TwoViewParams};
 
@@ -41,6 +41,8 @@ pub struct Config {
     pub single: SingleParams,
     /// Localization of a set.
     pub camset: CamsetParams,
+    /// What localized photos add to the scene.
+    pub growth: GrowthParams,
 }
 
 /// Where the features of query photos differ from the scene's.
@@ -136,7 +138,7 @@ impl Config {
     /// When a value has no TOML form.
     pub fn scene_toml(&self) -> Result<String> {
         let mut table = toml::Table::try_from(self)?;
-        for localization in ["single", "camset"] {
+        for localization in ["single", "camset", "growth"] {
             table.remove(localization);
         }
         Ok(toml::to_string_pretty(&table)?)

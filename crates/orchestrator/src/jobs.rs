@@ -1,12 +1,14 @@
 //! The job kinds and how they depend on each other.
 
 mod alignment;
+mod grow;
 mod likely;
 mod locate;
 mod model;
 mod pairs;
 mod scene;
 
+pub use grow::{LocatedJobs, add_grown};
 pub use likely::LikelyJobs;
 pub use locate::{LocateJobs, SetJobs, add_set, add_singles};
 pub use model::{ModelJobs, ModelKind, add_features_of, add_model};

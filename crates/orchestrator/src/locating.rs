@@ -1,6 +1,7 @@
-//! Locates photos in a scene: alone, as a set, or as a set when alone fails.
+//! Locates photos in a scene: alone, as a set, or as a set when alone fails; and lets the scene grow by them.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use anyhow::Result;
 use setloc_camset::{PhotoLocalization, SetLocalization, SingleLocalization, Verdict};
@@ -8,8 +9,10 @@ use setloc_sfm::MapperOutput;
 
 use crate::building::alike_pairs;
 use crate::dataset::{ImageFolder, SkippedImage};
-use crate::graph::{JobGraph, JobId, RunResult};
-use crate::jobs::{LocateJobs, add_features_of, add_set, add_singles};
+use crate::fingerprint::ContentHash;
+use crate::graph::{JobGraph, RunResult};
+use crate::jobs::{LocateJobs, LocatedJobs, add_features_of, add_grown, add_set, add_singles};
+use crate::scene::SceneFile;
 use crate::session::Session;
 
 /// Which methods are tried.
@@ -47,21 +50,28 @@ impl Located {
     ///
     /// A photo whose own answer the set contradicts has the set's, which says so.
     pub fn answers(&self) -> Vec<(&'static str, &PhotoLocalization)> {
-        let refined = self.set.iter().flat_map(|set| set.refined.iter().map(|p| ("camset+opt", p)));
-        let rigid = self.set.iter().flat_map(|set| set.rigid.iter().map(|p| ("camset", p)));
-        let contradicted = |photo: &&PhotoLocalization| {
-            self.set.as_ref().is_some_and(|set| set.contradicted.contains(&photo.name))
-        };
-        let single = self.single.iter().filter(|photo| !contradicted(photo)).map(|p| ("single", p));
-        let mut best: BTreeMap<&str, (&'static str, &PhotoLocalization)> = BTreeMap::new();
-        for (method, photo) in single.chain(rigid).chain(refined) {
-            let better = |old: &PhotoLocalization| photo.verdict.rank() >= old.verdict.rank();
-            if best.get(photo.name.as_str()).is_none_or(|(_, old)| better(old)) {
-                best.insert(&photo.name, (method, photo));
-            }
-        }
-        best.into_values().collect()
+        best_answers(&self.single, self.set.as_ref())
     }
+}
+
+/// The same of photos alone and of their set.
+pub fn best_answers<'a>(
+    single: &'a [PhotoLocalization],
+    set: Option<&'a SetLocalization>,
+) -> Vec<(&'static str, &'a PhotoLocalization)> {
+    let refined = set.into_iter().flat_map(|set| set.refined.iter().map(|p| ("camset+opt", p)));
+    let rigid = set.into_iter().flat_map(|set| set.rigid.iter().map(|p| ("camset", p)));
+    let contradicted =
+        |photo: &&PhotoLocalization| set.is_some_and(|set| set.contradicted.contains(&photo.name));
+    let single = single.iter().filter(|photo| !contradicted(photo)).map(|p| ("single", p));
+    let mut best: BTreeMap<&str, (&'static str, &PhotoLocalization)> = BTreeMap::new();
+    for (method, photo) in single.chain(rigid).chain(refined) {
+        let better = |old: &PhotoLocalization| photo.verdict.rank() >= old.verdict.rank();
+        if best.get(photo.name.as_str()).is_none_or(|(_, old)| better(old)) {
+            best.insert(&photo.name, (method, photo));
+        }
+    }
+    best.into_values().collect()
 }
 
 /// Locates photos; `target` is the photo that decides in [`Mode::Auto`].
@@ -101,21 +111,8 @@ fn run(
     (alone, as_set): (bool, bool),
     located: &mut Located,
 ) -> Result<RunResult> {
-    let (alike, before) = if as_set {
-        alike_pairs(session, name, &folder.images, &what.config.photo_features(), &what.config)?
-    } else {
-        (Vec::new(), RunResult::default())
-    };
-    let mut graph = JobGraph::default();
-    let set = as_set.then(|| add_set(&mut graph, target, &folder.images, &alike, what)).transpose()?;
-    let features = match &set {
-        Some(set) => set.model.features.clone(),
-        None => add_features_of(&mut graph, &folder.images, &what.config.photo_features()),
-    };
-    let single: Vec<JobId> = match &set {
-        Some(set) => set.single.clone(),
-        None => add_singles(&mut graph, &folder.images, &features, what),
-    };
+    let LocateGraph { graph, jobs: LocatedJobs { features, single, set }, before } =
+        LocateGraph::new(session, folder, what, (name, target), as_set)?;
     session.run(name, &graph, |executor, result| {
         for (photo, job) in folder.images.iter().zip(&features) {
             let known = located.skipped.iter().any(|skipped| skipped.name == photo.name);
@@ -134,6 +131,87 @@ fn run(
             located.local_models = model.components.iter().map(|c| c.registered().count()).collect();
         }
         Ok(before.and(result.clone()))
+    })
+}
+
+/// The jobs that locate photos, and what finding their pairs took.
+struct LocateGraph<'a> {
+    graph: JobGraph<'a>,
+    jobs: LocatedJobs,
+    before: RunResult,
+}
+
+impl LocateGraph<'_> {
+    fn new(
+        session: &Session,
+        folder: &ImageFolder,
+        what: &LocateJobs,
+        (name, target): (&str, &str),
+        as_set: bool,
+    ) -> Result<Self> {
+        let photos = what.config.photo_features();
+        let (alike, before) = if as_set {
+            alike_pairs(session, name, &folder.images, &photos, &what.config)?
+        } else {
+            (Vec::new(), RunResult::default())
+        };
+        let mut graph = JobGraph::default();
+        let jobs = if as_set {
+            let set = add_set(&mut graph, target, &folder.images, &alike, what)?;
+            LocatedJobs { features: set.model.features.clone(), single: set.single.clone(), set: Some(set) }
+        } else {
+            let features = add_features_of(&mut graph, &folder.images, &photos);
+            let single = add_singles(&mut graph, &folder.images, &features, what);
+            LocatedJobs { features, single, set: None }
+        };
+        Ok(Self { graph, jobs, before })
+    }
+}
+
+/// A scene that has grown.
+pub struct Grown {
+    /// The scene.
+    pub scene: Arc<SceneFile>,
+    /// The bytes of its file.
+    pub file: Arc<Vec<u8>>,
+    /// Their content hash.
+    pub hash: ContentHash,
+}
+
+/// Adds those photos to the scene that are localized and not in it yet; `None` when there are none.
+///
+/// The photos are those just located, under another name of a run.
+///
+/// # Errors
+/// When the run was stopped or the store cannot be written.
+pub fn grow(
+    session: &Session,
+    folder: &ImageFolder,
+    what: &LocateJobs,
+    (name, target): (&str, &str),
+    located: &Located,
+) -> Result<Option<Grown>> {
+    let is_new = |name: &str| {
+        let photo = folder.images.iter().find(|photo| photo.name == name);
+        photo.is_some_and(|photo| !what.scene.grown_from.contains(&photo.hash))
+    };
+    let adds = |photo: &PhotoLocalization| photo.verdict == Verdict::Localized && is_new(&photo.name);
+    if !located.answers().iter().any(|(_, photo)| adds(photo)) {
+        return Ok(None);
+    }
+    let LocateGraph { mut graph, jobs, before } =
+        LocateGraph::new(session, folder, what, (name, target), located.set.is_some())?;
+    let grown = add_grown(&mut graph, target, &folder.images, &jobs, !located.single.is_empty(), what)?;
+    graph.want(grown);
+    graph.want_file(grown);
+    session.run(name, &graph, |executor, run| {
+        session.remember(name, &before.and(run.clone()))?;
+        let Some(hash) = executor.output(grown) else {
+            let reasons: Vec<String> =
+                run.failed.iter().map(|(job, reason)| format!("{job}: {reason}")).collect();
+            anyhow::bail!("the scene could not grow: {}", reasons.join("; "));
+        };
+        Ok(Some(Grown { scene: executor.load(grown)?, file: executor.file::<SceneFile>(grown)?, hash }))
     })
 }
 

@@ -1,9 +1,11 @@
 //! A scene file: everything that localization needs, in one file.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
+use setloc_camset::GrownImage;
 use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
 use setloc_sfm::{ImageId, Reconstruction};
@@ -31,11 +33,15 @@ pub struct SceneFile {
     pub notes: Vec<String>,
     /// The configuration it was built with, as TOML: of the stages that a scene depends on.
     pub config: String,
+    /// Images of the first component that are photos which it has grown by, ascending; they come after all others.
+    pub grown: Vec<GrownImage>,
+    /// Contents of these photos' files, in the same order.
+    pub grown_from: Vec<ContentHash>,
     /// Hash of what localization depends on: the models and the index, not how images are called or what was set.
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 8);
+serde_artifact!(SceneFile, "scene", 9);
 
 /// Bytes that are stored as one block.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -64,6 +70,12 @@ impl SceneFile {
             let error = anyhow::Error::new(error).context(format!("{} is no usable scene", path.display()));
             Hinted::wrap(error, "build it again with `setloc build PANORAMAS -o scene.setloc`")
         })
+    }
+
+    /// Names of the images that are photos which it has grown by.
+    pub fn grown_names(&self) -> BTreeSet<&str> {
+        let images = self.main().map_or(&[][..], |model| &model.images);
+        self.grown.iter().filter_map(|grown| Some(images.get(grown.image.index())?.name.as_str())).collect()
     }
 
     /// The largest component.

@@ -29,11 +29,14 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// 2: holds the hash of what localization depends on, and only the configuration that the scene depends on.
 /// 4: notes. 6: models state lengths that their points do not tell. 7: and the poses at
 /// their ends. 8: holds features of its images. 9: half as many.
-pub const SCENE_VERSION: u32 = 9;
+/// 10: says which images it has grown by.
+pub const SCENE_VERSION: u32 = 10;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
 /// Version of set localization.
 pub const CAMSET_VERSION: u32 = setloc_camset::VERSION;
+/// Version of the growth of scenes.
+pub const GROW_VERSION: u32 = setloc_camset::GROWTH_VERSION;
 
 /// JPEG quality of the sample town.
 const SAMPLE_QUALITY: u8 = 92;

@@ -103,6 +103,46 @@ fn report_and_status_tell_what_came_out() {
 }
 
 #[test]
+fn a_scene_grows_by_localized_photos_and_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    town(folder.path());
+    let run = |arguments: &[&str]| setloc(folder.path(), arguments);
+    let cameras = ["--cameras", "town/cameras.json"];
+    let build = run(&[&["build", "town/panoramas", "-o", "s.setloc"], &cameras[..]].concat());
+    assert_eq!(build.status.code(), Some(0), "{}", said(&build));
+    panoramas(folder.path(), 2);
+    let foreign = run(&["locate", "s.setloc", "panoramas", "--grow", "g.setloc"]);
+    assert_eq!(foreign.status.code(), Some(1), "{}", said(&foreign));
+    let refusal = "g.setloc is not written: no photo is localized\nhint: ";
+    assert!(said(&foreign).contains(refusal), "{}", said(&foreign));
+    assert!(!folder.path().join("g.setloc").exists());
+
+    let grow = |from, to| {
+        let arguments = ["locate", from, "town/queries/lane", "--target", "img_00.jpg", "--grow", to];
+        run(&[&arguments, &cameras[..]].concat())
+    };
+    let grown = grow("s.setloc", "g.setloc");
+    assert_eq!(grown.status.code(), Some(0), "{}", said(&grown));
+    assert!(said(&grown).contains("grown-1: grown by "), "{}", said(&grown));
+    let file = std::fs::read(folder.path().join("g.setloc")).unwrap();
+    let report = gave(&run(&["report", "g.setloc"]));
+    for part in [" of them added by growth", "grown-1/lane/img_00.jpg\tadded by growth", "note: grown-1: "] {
+        assert!(report.contains(part), "{part}: {report}");
+    }
+    let poses = std::fs::read_to_string(folder.path().join("g/poses.json")).unwrap();
+    assert!(poses.contains("\"grown\": true") && poses.contains("\"grown\": false"), "{poses}");
+    let colmap = std::fs::read_to_string(folder.path().join("g/colmap/images.txt")).unwrap();
+    assert!(colmap.contains("grown-1/lane/img_00.jpg"), "{colmap}");
+
+    // The same again is the same, and what it has grown by it does not grow by again.
+    assert_eq!(grow("s.setloc", "h.setloc").status.code(), Some(0));
+    assert_eq!(std::fs::read(folder.path().join("h.setloc")).unwrap(), file);
+    let again = grow("g.setloc", "i.setloc");
+    assert_eq!(again.status.code(), Some(1), "{}", said(&again));
+    assert!(said(&again).contains("all photos that are localized are in the scene"), "{}", said(&again));
+}
+
+#[test]
 fn plan_and_explain_name_the_parameter_that_changed() {
     let folder = tempfile::tempdir().unwrap();
     town(folder.path());

@@ -190,6 +190,9 @@ pub struct LocateArgs {
     /// Known intrinsics
     #[arg(long, value_name = "cameras.json")]
     pub cameras: Option<PathBuf>,
+    /// Also write the scene grown by the photos that are localized; each is tried alone and the set
+    #[arg(long, value_name = "grown.setloc")]
+    pub grow: Option<PathBuf>,
     /// Folder for the results
     #[arg(short, long, default_value = "out")]
     pub output: PathBuf,

@@ -151,6 +151,7 @@ fn locate_args(set: &SetEntry, scene: &Path, folder: &Path, places: &Places<'_>)
         target: set.target.clone(),
         mode: Mode::Auto,
         cameras: set.cameras.as_ref().map(|path| places.base.join(path)),
+        grow: None,
         output: folder.join(&set.name),
         run: places.run.clone(),
     }

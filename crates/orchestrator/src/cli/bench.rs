@@ -1,4 +1,4 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
@@ -170,7 +170,7 @@ pub fn write_figures(folder: &Path, figures: &DatasetFigures) -> Result<()> {
     write_json(&folder.join("poses.json"), &peers_poses(&scene.collect()))?;
     write_atomically(
         &folder.join("top_view.png"),
-        &top_view_png(&figures.model, &scene_markers(&figures.model))?,
+        &top_view_png(&figures.model, &scene_markers(&figures.model, &BTreeSet::new()))?,
     )?;
     for set in &figures.sets {
         for (method, of_method) in &set.methods {
@@ -181,7 +181,7 @@ pub fn write_figures(folder: &Path, figures: &DatasetFigures) -> Result<()> {
                 folder.join("sets").join(&set.name).join(format!("{method}.{name}"))
             };
             write_json(&file("poses.json"), &peers_poses(&poses))?;
-            let mut markers = scene_markers(&figures.model);
+            let mut markers = scene_markers(&figures.model, &BTreeSet::new());
             for (name, world_from_camera) in &poses {
                 let color = if *name == set.target { [220, 30, 30] } else { [240, 150, 0] };
                 markers.push(Marker { world_from_camera: *world_from_camera, color, directed: true });

@@ -1,4 +1,6 @@
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::Result;
 use rayon::prelude::*;
@@ -23,6 +25,8 @@ use crate::store::{RunRecord, Store, write_atomically};
 
 /// Blue, for cameras of the scene.
 pub const SCENE_COLOR: [u8; 3] = [30, 90, 220];
+/// Green, for photos that a scene has grown by.
+const GROWN_COLOR: [u8; 3] = [20, 150, 60];
 
 /// `setloc build`
 pub fn run(args: &BuildArgs) -> Result<Answer> {
@@ -40,8 +44,8 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     // The report is written last: exports of another scene, as a killed run leaves them, are none of this one.
     let present = present.filter(|hash| reported_scene(&export) == Some(*hash));
     let write = |built: &Built| {
-        let (scene, models) =
-            rayon::join(|| write_atomically(output, &built.file), || write_models(&export, built));
+        let models = || write_models(&export, &built.scene, &built.features);
+        let (scene, models) = rayon::join(|| write_atomically(output, &built.file), models);
         scene.and(models)
     };
     let seed = args.source.run.seed;
@@ -52,7 +56,7 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
             (run, skipped)
         }
         BuildOutcome::Built(built) => {
-            write_report(&export, built, &folder, &session)?;
+            write_report(&export, (&built.scene, built.hash), &built.skipped, &folder.warnings, &session)?;
             summarize(&built.scene, folder.images.len() + folder.skipped.len());
             if let Some(lack) = built.scene.main().and_then(colmap_lacks) {
                 print::note(&format!("warning: no COLMAP model is written: {lack}"));
@@ -162,44 +166,52 @@ pub fn export_folder(output: &Path) -> PathBuf {
     if folder == output { PathBuf::from(format!("{}-export", output.display())) } else { folder }
 }
 
-/// Blue markers for the registered images of a model.
-pub fn scene_markers(model: &Reconstruction) -> Vec<Marker> {
+/// Blue markers for the registered images of a model, green ones for those of the names `grown`.
+pub fn scene_markers(model: &Reconstruction, grown: &BTreeSet<&str>) -> Vec<Marker> {
     let marker = |id: setloc_sfm::ImageId| {
         let directed = !model.camera_of(id).is_panoramic();
-        let pose = model.images[id.index()].world_from_camera;
-        pose.map(|world_from_camera| Marker { world_from_camera, color: SCENE_COLOR, directed })
+        let image = &model.images[id.index()];
+        let color = if grown.contains(image.name.as_str()) { GROWN_COLOR } else { SCENE_COLOR };
+        image.world_from_camera.map(|world_from_camera| Marker { world_from_camera, color, directed })
     };
     model.registered().filter_map(marker).collect()
 }
 
-/// Poses, point cloud, COLMAP model and picture.
-fn write_models(folder: &Path, built: &Built) -> Result<()> {
-    let model = &built.scene.main().map_or_else(Reconstruction::default, Reconstruction::by_name);
-    let markers = scene_markers(model);
+/// Poses, point cloud, COLMAP model and picture; with features by image name, the COLMAP model has the tracks.
+pub fn write_models(
+    folder: &Path,
+    scene: &SceneFile,
+    features: &BTreeMap<String, Arc<ImageFeatures>>,
+) -> Result<()> {
+    let model = &scene.main().map_or_else(Reconstruction::default, Reconstruction::by_name);
+    let markers = scene_markers(model, &scene.grown_names());
     let centres: Vec<_> =
         markers.iter().map(|marker| (marker.world_from_camera.translation, marker.color)).collect();
-    let features: Vec<Option<&ImageFeatures>> = model
-        .images
-        .iter()
-        .map(|image| built.features.get(&image.name).map(|features| &**features))
-        .collect();
+    let features: Vec<Option<&ImageFeatures>> =
+        model.images.iter().map(|image| features.get(&image.name).map(|features| &**features)).collect();
     let writers: [&(dyn Fn() -> Result<()> + Sync); 4] = [
         // What COLMAP lacks is said when the scene is.
         &|| renew_colmap(&folder.join("colmap"), model, &features).map(drop),
         &|| write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes()),
-        &|| write_json(&folder.join("poses.json"), &scene_json(&built.scene)),
+        &|| write_json(&folder.join("poses.json"), &scene_json(scene)),
         &|| write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?),
     ];
     writers.into_par_iter().with_max_len(1).try_for_each(|write| write())
 }
 
-/// What the build cost and what is wrong with the scene; written last.
-fn write_report(folder: &Path, built: &Built, images: &ImageFolder, session: &Session) -> Result<()> {
+/// What the run cost and what is wrong with the scene, and with the images that it was given; written last.
+pub fn write_report(
+    folder: &Path,
+    (scene, hash): (&SceneFile, ContentHash),
+    skipped: &[SkippedImage],
+    warnings: &[String],
+    session: &Session,
+) -> Result<()> {
     let mut report = session.report.to_json();
-    report["scene"] = serde_json::json!(built.hash);
-    report["skipped"] = serde_json::json!(built.skipped);
-    report["warnings"] = serde_json::json!([&images.warnings[..], &built.scene.warnings].concat());
-    report["notes"] = serde_json::json!(built.scene.notes);
+    report["scene"] = serde_json::json!(hash);
+    report["skipped"] = serde_json::json!(skipped);
+    report["warnings"] = serde_json::json!([warnings, &scene.warnings].concat());
+    report["notes"] = serde_json::json!(scene.notes);
     write_json(&folder.join("report.json"), &report)
 }
 

@@ -16,7 +16,7 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
     let model = &scene.main().map_or_else(Reconstruction::default, Reconstruction::by_name);
     let needs_output =
         || Hinted::error("this format is not written to standard output", "name a file or folder with -o");
-    let markers = scene_markers(model);
+    let markers = scene_markers(model, &scene.grown_names());
     let posed = |image: &ReconstructionImage| Some((image.name.clone(), image.world_from_camera?));
     let poses = || model.images.iter().filter_map(posed).collect::<Vec<_>>();
     let text = match args.format {

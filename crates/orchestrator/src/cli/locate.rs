@@ -1,3 +1,4 @@
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -8,12 +9,14 @@ use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage};
 
 use super::Answer;
 use super::args::LocateArgs;
-use super::build::{remark, scene_markers, warn_skipped, write_json};
+use super::build::{
+    export_folder, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
+};
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use crate::error::Hinted;
 use crate::export::{Marker, localizations_json, ply, renew_colmap, top_view_png};
 use crate::jobs::LocateJobs;
-use crate::locating::{Located, locate};
+use crate::locating::{Located, Mode, grow, locate};
 use crate::print;
 use crate::scene::SceneFile;
 use crate::session::Session;
@@ -46,7 +49,12 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Located, Answer)> {
     let session = args.run.session(&args.scene, Some(&args.output))?;
     let what = LocateJobs { scene: Arc::new(scene), config, seed: args.run.seed };
     let name = session.store.name_of("locate", &args.output);
-    let located = locate(&session, &photos, &what, args.mode, &name, &target)?;
+    let mode = match args.mode {
+        // The scene grows by all photos, whatever the target is.
+        Mode::Auto if args.grow.is_some() => Mode::Both,
+        mode => mode,
+    };
+    let located = locate(&session, &photos, &what, mode, &name, &target)?;
     write_results(&args.output, &located, &what.scene, &target, &session)?;
     warn_skipped(&located.skipped);
     warn_of_scene(&what.scene.warnings);
@@ -59,7 +67,45 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Located, Answer)> {
     let verdict = answer.map_or(Verdict::NotLocalized, |(_, photo)| photo.verdict);
     let found = verdict == Verdict::Localized;
     print::note(&format!("target {target}: {}", verdict.in_words()));
-    Ok((located, if found { Answer::Done } else { Answer::Negative }))
+    let grown = match &args.grow {
+        Some(output) => write_grown(output, &session, &photos, &what, (&target, &located))?,
+        None => true,
+    };
+    Ok((located, if found && grown { Answer::Done } else { Answer::Negative }))
+}
+
+/// Writes the scene that has grown, with its exports; false when there is nothing to grow by.
+fn write_grown(
+    output: &Path,
+    session: &Session,
+    photos: &ImageFolder,
+    what: &LocateJobs,
+    (target, located): (&str, &Located),
+) -> Result<bool> {
+    let name = session.store.name_of("grow", output);
+    let Some(grown) = grow(session, photos, what, (&name, target), located)? else {
+        let is_localized = |(_, photo): &(&str, &PhotoLocalization)| photo.verdict == Verdict::Localized;
+        let (reason, hint) = if located.answers().iter().any(is_localized) {
+            ("all photos that are localized are in the scene", "name photos that it has not grown by yet")
+        } else {
+            (
+                "no photo is localized",
+                "add photos that lead from the panoramas to these: the advice says where",
+            )
+        };
+        print::note(&format!("{} is not written: {reason}", output.display()));
+        print::note(&format!("hint: {hint}"));
+        return Ok(false);
+    };
+    let export = export_folder(output);
+    write_atomically(output, &grown.file)?;
+    write_models(&export, &grown.scene, &BTreeMap::new())?;
+    write_report(&export, (&grown.scene, grown.hash), &[], &[], session)?;
+    if let Some(note) = grown.scene.notes.last() {
+        print::note(note);
+    }
+    print::note(&format!("wrote {} and {}/", output.display(), export.display()));
+    Ok(true)
 }
 
 /// What the build of the scene warned of: a photo's pose is as right as the scene is.
@@ -138,7 +184,7 @@ fn write_results(
     )?;
     let empty = Reconstruction::default();
     let model = scene.main().unwrap_or(&empty);
-    let mut markers = scene_markers(model);
+    let mut markers = scene_markers(model, &scene.grown_names());
     let mut merged = model.clone();
     for photo in &best {
         let Some(world_from_camera) = photo.world_from_camera else { continue };

@@ -130,6 +130,9 @@ const RANGES: &[(&str, Range)] = &[
     ("camset.rounds", Range::NotNegative),
     ("camset.views.max_images", Range::NotNegative),
     ("camset.views.min_inliers", Range::From(6.0)),
+    ("growth.min_photos", Range::From(2.0)),
+    ("growth.min_parallax_deg", Range::Within(0.0, 180.0)),
+    ("growth.max_point_sigma", Range::Positive),
 ];
 
 /// The range of a key: that of the longest end of it that ends at a `.` or `_`.

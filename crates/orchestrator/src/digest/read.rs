@@ -41,6 +41,9 @@ struct SceneImage {
     name: String,
     world_from_camera: Option<IgnoredAny>,
     observations: usize,
+    /// Whether it is a photo that the scene has grown by.
+    #[serde(default)]
+    grown: bool,
 }
 
 #[derive(Deserialize)]
@@ -134,12 +137,15 @@ fn of_scene(name: &str, scene: ScenePoses, skipped: Vec<SkippedImage>) -> Digest
         };
     };
     let registered = main.images.iter().filter(|image| image.world_from_camera.is_some()).count();
-    let mut observations: Vec<usize> = main.images.iter().map(|image| image.observations).collect();
+    let grown = main.images.iter().filter(|image| image.grown).count();
+    let built = main.images.iter().filter(|image| !image.grown);
+    let mut observations: Vec<usize> = built.map(|image| image.observations).collect();
     observations.sort_unstable();
     let least = WEAK_SHARE * observations.get(observations.len() / 2).map_or(0.0, |&median| median as f64);
     let row = |image: &SceneImage| {
         let (standing, verdict) = match &image.world_from_camera {
             None => (Standing::Bad, "not registered"),
+            Some(_) if image.grown => (Standing::Good, "added by growth"),
             Some(_) if (image.observations as f64) < least => (Standing::Weak, "weakly tied"),
             Some(_) => (Standing::Good, "registered"),
         };
@@ -175,8 +181,9 @@ fn of_scene(name: &str, scene: ScenePoses, skipped: Vec<SkippedImage>) -> Digest
     Digest {
         title: format!("Scene {name}"),
         headline: format!(
-            "{registered} of {} images registered, {} points, {} observations.",
+            "{registered} of {} images registered{}, {} points, {} observations.",
             main.images.len(),
+            if grown > 0 { format!(", {grown} of them added by growth") } else { String::new() },
             main.points,
             main.observations
         ),

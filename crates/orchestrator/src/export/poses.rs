@@ -11,8 +11,9 @@ pub fn pose_json(pose: &Rigid) -> Value {
     json!({ "q_wxyz": [q.w, q.i, q.j, q.k], "center": [c.x, c.y, c.z] })
 }
 
-/// All cameras and poses of a scene.
+/// All cameras and poses of a scene; `grown` are images that it has grown by.
 pub fn scene_json(scene: &SceneFile) -> Value {
+    let grown = scene.grown_names();
     let components: Vec<Value> = scene.components.iter().map(|model| {
         let model = model.by_name();
         let observations = observations_of(&model);
@@ -23,6 +24,7 @@ pub fn scene_json(scene: &SceneFile) -> Value {
             json!({
                 "name": image.name, "world_from_camera": pose.map(pose_json), "wgs84": place,
                 "camera": model.camera_of(id), "observations": observations[id.index()],
+                "grown": grown.contains(image.name.as_str()),
             })
         }).collect();
         json!({ "points": model.points.len(), "observations": model.observation_count(), "images": images })

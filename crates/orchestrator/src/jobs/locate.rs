@@ -76,7 +76,7 @@ pub fn add_set(
     graph.require(set, "local_model", model.model);
     for (at, (features, single)) in model.features.iter().zip(&single).enumerate() {
         graph.accept(set, features_role(at), *features);
-        graph.accept(set, format!("single {at:04}"), *single);
+        graph.accept(set, single_role(at), *single);
     }
     Ok(SetJobs { model, single, set })
 }
@@ -88,7 +88,7 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
         // The local model has the same images in the same order: those whose features exist.
         let Some(found) = inputs.find::<ImageFeatures>(&features_role(at))? else { continue };
         features.push((photo, found));
-        let by_itself = inputs.find::<SingleLocalization>(&format!("single {at:04}"))?;
+        let by_itself = inputs.find::<SingleLocalization>(&single_role(at))?;
         alone.push(by_itself.with_context(|| format!("{} was not located alone", photo.name))?);
     }
     let alone: Vec<&SingleLocalization> = alone.iter().map(|found| &**found).collect();
@@ -146,10 +146,15 @@ fn add_single(graph: &mut JobGraph<'_>, photo: &SourceImage, features: JobId, wh
     single
 }
 
-fn query<'a>(photo: &'a SourceImage, features: &'a ImageFeatures) -> QueryPhoto<'a> {
+/// The role of the localization of a photo alone.
+pub(super) fn single_role(photo: usize) -> String {
+    format!("single {photo:04}")
+}
+
+pub(super) fn query<'a>(photo: &'a SourceImage, features: &'a ImageFeatures) -> QueryPhoto<'a> {
     QueryPhoto { name: &photo.name, camera: &photo.camera, camera_fixed: photo.camera_fixed, features }
 }
 
-fn scene_of<'a>(scene: &'a SceneFile, empty: &'a Reconstruction) -> Scene<'a> {
-    Scene { reconstruction: scene.main().unwrap_or(empty), index: &scene.index, grown: &[] }
+pub(super) fn scene_of<'a>(scene: &'a SceneFile, empty: &'a Reconstruction) -> Scene<'a> {
+    Scene { reconstruction: scene.main().unwrap_or(empty), index: &scene.index, grown: &scene.grown }
 }

@@ -104,6 +104,8 @@ pub fn add_scene(
                 .chain(index.recall().map(measured_recall))
                 .collect(),
             config: config.clone(),
+            grown: Vec::new(),
+            grown_from: Vec::new(),
             content: ContentHash::of_all(&content),
         })
     };
@@ -130,7 +132,7 @@ pub fn add_scene(
 
 /// Keypoints of an image that go into the scene file, of the bright and of the dark; twice as many cost 200
 /// panoramas 60 MB more.
-const KEPT_FEATURES: usize = 1024;
+pub(super) const KEPT_FEATURES: usize = 1024;
 
 /// The strongest features of the registered images of the largest component, as blocks.
 fn features_of_main(inputs: &Inputs<'_, '_>, output: &MapperOutput) -> Result<Vec<Block>> {
