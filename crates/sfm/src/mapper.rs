@@ -20,6 +20,7 @@ mod structure;
 #[cfg(test)]
 mod test_street;
 mod wall;
+mod witnesses;
 
 use std::collections::BTreeMap;
 
@@ -48,16 +49,17 @@ use self::{
     repeated::Underfoot,
     standpoint::Standpoints,
     structure::{PointLimits, complete_and_merge, filter, triangulate_image, triangulate_match},
+    witnesses::{Testimony, Witnesses},
 };
 use crate::{
-    BaselineLength, CameraId, Georegistration, ImageId, Observation, PairGeometry, Reconstruction, Rigid,
-    TwoViewKind, TwoViewParams,
+    BaselineLength, CameraId, Georegistration, ImageId, Observation, PairGeometry, PointId, Reconstruction,
+    Rigid, TwoViewKind, TwoViewParams,
     bundle::{BundleParams, RobustLoss},
     robust::RansacParams,
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 19;
+pub const MAPPER_VERSION: u32 = 20;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -278,16 +280,24 @@ pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) ->
         return standpoints.expand(reconstruct_images(params, &standpoints.input(), seed));
     }
     let output = reconstruct_images(params, input, seed);
-    let better =
-        Underfoot::find(input).and_then(|underfoot| underfoot.better_input(&output.components, seed));
-    let Some((rest, warning)) = better else { return output };
-    let input = MapperInput { pairs: &rest.pairs, putative: &rest.putative, ..input.clone() };
-    let mut output = reconstruct_images(params, &input, seed);
-    output.report.warnings.push(warning);
-    output
+    let Some(underfoot) = Underfoot::find(input) else { return output };
+    let Some((rest, warning)) = underfoot.better_input(&output.components, seed) else { return output };
+    let bare = MapperInput { pairs: &rest.pairs, putative: &rest.putative, ..input.clone() };
+    let (parts, mut report) = map_parts(params, &bare, seed);
+    report.warnings.push(warning);
+    let pairs = underfoot.borne_out(&parts);
+    let input = MapperInput { pairs: &pairs, ..input.clone() };
+    let parts = grow_again(params, &input, parts, &underfoot.witnesses(&pairs), &mut report, seed);
+    finished(params, &input, parts, report, seed)
 }
 
 fn reconstruct_images(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
+    let (parts, report) = map_parts(params, input, seed);
+    finished(params, input, parts, report, seed)
+}
+
+/// All components, largest first, and those that a similarity is supported between as one.
+fn map_parts(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> (Vec<Part>, MapperReport) {
     let mut report = MapperReport::default();
     let mut parts: Vec<Part> = Vec::new();
     let mut taken = vec![false; input.images.len()];
@@ -307,7 +317,46 @@ fn reconstruct_images(params: &MapperParams, input: &MapperInput<'_>, seed: u64)
         }
         parts.push(mapper.into_part());
     }
-    let parts = merge::join_supported(params, input, parts, &mut report, seed);
+    (merge::join_supported(params, input, parts, &mut report, seed), report)
+}
+
+/// The parts with what pairs add to them that they were not made of, largest first; witnesses judge who joins.
+fn grow_again(
+    params: &MapperParams,
+    input: &MapperInput<'_>,
+    mut parts: Vec<Part>,
+    witnesses: &Witnesses,
+    report: &mut MapperReport,
+    seed: u64,
+) -> Vec<Part> {
+    for at in 0..parts.len() {
+        let mut taken = vec![false; input.images.len()];
+        let others = parts[..at].iter().chain(&parts[at + 1..]);
+        for image in others.flat_map(|part| part.component.registered()) {
+            taken[image.index()] = true;
+        }
+        let part = &parts[at];
+        let mut mapper = Mapper::over(params, Model::open(input, &part.component), taken, seed);
+        mapper.anchors.clone_from(&part.anchors);
+        mapper.witnesses = Some(witnesses);
+        mapper.refine(2, 20);
+        mapper.grow();
+        mapper.finish();
+        report.registrations.append(&mut mapper.records);
+        parts[at] = mapper.into_part();
+    }
+    parts.sort_by_key(|part| std::cmp::Reverse(part.component.registered().count()));
+    parts
+}
+
+/// The parts as they are handed over.
+fn finished(
+    params: &MapperParams,
+    input: &MapperInput<'_>,
+    parts: Vec<Part>,
+    report: MapperReport,
+    seed: u64,
+) -> MapperOutput {
     let parts = parts.into_iter().map(|part| seen_again(params, input, part, seed));
     MapperOutput { components: parts.map(|part| part.component).collect(), report }
 }
@@ -368,6 +417,8 @@ struct Mapper<'a> {
     planes_tried: BTreeMap<usize, usize>,
     records: Vec<RegistrationRecord>,
     images_at_last_global: usize,
+    /// What judges poses in place of what is in plain view, where a floor repeats itself.
+    witnesses: Option<&'a Witnesses>,
     seed: u64,
 }
 
@@ -399,6 +450,7 @@ impl<'a> Mapper<'a> {
             baseline_tried: BTreeMap::new(),
             planes_tried: BTreeMap::new(),
             records: Vec::new(),
+            witnesses: None,
             seed,
         }
     }
@@ -698,7 +750,12 @@ impl<'a> Mapper<'a> {
             let seen = hypothesis.visibility;
             let judged = seen.expected >= self.params.min_visible_points;
             // Where a better supported pose was refused for what it does not see, this one needs evidence of its own.
-            let plausible = if judged { self.params.is_recognized(&seen) } else { !refused_before };
+            let testimony = self.testimony(image, &hypothesis.world_from_camera, &hypothesis.inliers);
+            let plausible = match testimony {
+                Some(testimony) => testimony.speaks_for(),
+                None if judged => self.params.is_recognized(&seen),
+                None => !refused_before,
+            };
             refused_before |= !plausible;
             let accepted = plausible
                 && self.pair_agreement(image, &hypothesis.world_from_camera)
@@ -710,6 +767,17 @@ impl<'a> Mapper<'a> {
             }
         }
         None
+    }
+
+    /// What those say that judge poses in place of what is in plain view; `None` where nobody does.
+    fn testimony(
+        &self,
+        image: ImageId,
+        world_from_camera: &Rigid,
+        inliers: &[(u32, PointId)],
+    ) -> Option<Testimony> {
+        let witnesses = self.witnesses?;
+        Some(witnesses.hear(&self.model, image, world_from_camera, inliers, self.params.max_error_sigma))
     }
 
     /// Share of an image's verified matches to registered images that belong to pairs whose rotation agrees with a pose.
@@ -758,9 +826,14 @@ impl<'a> Mapper<'a> {
         }
         let misplaced = |(at, &image): (usize, &ImageId)| {
             let pose = self.model.poses[image.index()]?.world_from_camera;
-            let seen = visibility(&self.model, image, &pose, &self.model.observations_of(image));
+            let observations = self.model.observations_of(image);
+            let seen = visibility(&self.model, image, &pose, &observations);
             let judged = seen.expected >= self.params.min_visible_points;
-            (judged && !self.params.is_recognized(&seen)).then_some((at, seen))
+            let is_misplaced = match self.testimony(image, &pose, &observations) {
+                Some(testimony) => testimony.speaks_against(),
+                None => judged && !self.params.is_recognized(&seen),
+            };
+            is_misplaced.then_some((at, seen))
         };
         images.par_iter().with_max_len(1).enumerate().find_map_first(misplaced)
     }

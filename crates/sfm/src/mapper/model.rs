@@ -66,6 +66,13 @@ impl<'a> Model<'a> {
         model
     }
 
+    /// The model of a component that other images may join.
+    pub fn open(input: &'a MapperInput<'a>, component: &Reconstruction) -> Self {
+        let mut model = Self::with_cameras(input, component.cameras.clone(), |_| true);
+        model.take_in(component, &Similarity::identity());
+        model
+    }
+
     /// The model of two components, the points of `moved` after those of `kept`.
     ///
     /// Intrinsics that were found in both are those of `kept`.

@@ -7,8 +7,9 @@ use rayon::prelude::*;
 use setloc_features::{Match, Rays};
 
 use super::sides::{compare, count_matches, count_shareable, sees_all_around};
-use super::{MapperInput, PutativePair};
-use crate::{ImageId, PairGeometry, Reconstruction, TwoViewKind, verify_pair};
+use super::witnesses::{Witnesses, count_on_circles};
+use super::{MapperInput, Part, PutativePair};
+use crate::{ImageId, PairGeometry, Reconstruction, Rigid, TwoViewKind, verify_pair};
 
 /// Share of all verified matches that must lie in one-sided geometries for a model to be judged by the rest. Rendered
 /// rooms with floors of exactly repeated tiles or planks have 0.12 to 0.78, two with other floors 0.03 and 0.05, rendered
@@ -26,7 +27,7 @@ const MIN_AGREEMENT: f64 = 0.5;
 const MIN_ELSEWHERE: f64 = 0.05;
 /// Largest angle in degrees between the baseline of such a pair and that of the model.
 const MAX_BASELINE_DEG: f64 = 15.0;
-/// Largest angle in degrees from the middle of what repeats itself to what is left out.
+/// Largest angle in degrees from straight down, or from the middle of what repeats itself, of what is left out.
 const MAX_REPEATED_DEG: f64 = 70.0;
 /// Share of the matches that a geometry explains on its worst side, relative to its best, below which it is one-sided.
 const MIN_SIDE_SHARE: f64 = 0.05;
@@ -41,7 +42,7 @@ const MIN_NEAR_SIDE_SHARE: f64 = 0.08;
 const MIN_SIDE_KEYPOINTS: usize = 60;
 
 /// Said of a place whose repeated side was left out.
-const WARNING: &str = "many verified matches lie underfoot only and what the rest tells contradicts them, as on a floor of equal tiles that makes places a whole number of tiles apart look one: that side was left out, and the scene is held by the rest; leaving it out of the features (nadir_cone_deg, masks) is safer";
+const WARNING: &str = "many verified matches lie underfoot only and what the rest tells contradicts them, as on a floor of equal tiles that makes places a whole number of tiles apart look one: the scene was made without that side, and of it holds only what agrees; leaving it out of the features (nadir_cone_deg, masks) is safer";
 
 /// Matches and pairs in place of an input's own.
 pub(super) struct Remainder {
@@ -57,11 +58,7 @@ fn agreement<'p>(
 ) -> Option<f64> {
     let mut judged: BTreeMap<(ImageId, ImageId), (usize, bool)> = BTreeMap::new();
     for pair in pairs.filter(|pair| pair.two_view.kind != TwoViewKind::PureRotation) {
-        let placed = components.iter().find_map(|component| {
-            let pose = |image: ImageId| component.images[image.index()].world_from_camera;
-            Some(pose(pair.second)?.inverse() * pose(pair.first)?)
-        });
-        let Some(placed) = placed else { continue };
+        let Some(placed) = second_from_first(pair, components) else { continue };
         let angle = placed.translation.angle(&pair.two_view.second_from_first.translation);
         let (matches, agrees) = judged.entry((pair.first, pair.second)).or_default();
         *matches = pair.two_view.inliers.len().max(*matches);
@@ -72,15 +69,28 @@ fn agreement<'p>(
     (judged.len() >= MIN_JUDGING_PAIRS && all > 0).then(|| agreeing as f64 / all as f64)
 }
 
+/// The first camera of a pair in the second's frame, by the component that both are in.
+fn second_from_first<'c>(
+    pair: &PairGeometry,
+    components: impl IntoIterator<Item = &'c Reconstruction>,
+) -> Option<Rigid> {
+    components.into_iter().find_map(|component| {
+        let pose = |image: ImageId| component.images[image.index()].world_from_camera;
+        Some(pose(pair.second)?.inverse() * pose(pair.first)?)
+    })
+}
+
 /// What the pairs of an input see underfoot only.
 pub(super) struct Underfoot<'a> {
     input: &'a MapperInput<'a>,
     /// Of panoramas that see all around.
     rays: Vec<Option<Rays>>,
-    /// Pairs of the input that explain what lies underfoot and nothing else.
-    one_sided: Vec<&'a PairGeometry>,
-    /// Where each image sees that, of any length.
-    poles: Vec<Vector3<f64>>,
+    /// Whether a pair of the input explains what lies underfoot and nothing else.
+    is_one_sided: Vec<bool>,
+    /// The middle of what each image sees of that, of any length: up to 38° aside, where it sees most of it.
+    middles: Vec<Vector3<f64>>,
+    /// Straight down for images that do, else zero.
+    downs: Vec<Vector3<f64>>,
 }
 
 impl<'a> Underfoot<'a> {
@@ -95,23 +105,31 @@ impl<'a> Underfoot<'a> {
             .collect();
         let matches: BTreeMap<(ImageId, ImageId), &[Match]> =
             input.putative.iter().map(|pair| ((pair.first, pair.second), &pair.matches[..])).collect();
-        let one_sided: Vec<&PairGeometry> = (input.pairs.par_iter().with_max_len(8))
-            .filter(|pair| {
+        let is_one_sided: Vec<bool> = (input.pairs.par_iter().with_max_len(8))
+            .map(|pair| {
                 let all = matches.get(&(pair.first, pair.second)).copied().unwrap_or_default();
                 both(&rays, pair.first, pair.second).is_some_and(|rays| is_one_sided(rays, pair, all))
             })
             .collect();
-        let mut poles = vec![Vector3::zeros(); rays.len()];
-        for pair in &one_sided {
+        let mut middles = vec![Vector3::zeros(); rays.len()];
+        for (pair, _) in input.pairs.iter().zip(&is_one_sided).filter(|(_, one_sided)| **one_sided) {
             for m in &pair.two_view.inliers {
                 for (image, feature) in [(pair.first, m.first), (pair.second, m.second)] {
                     if let Some(rays) = &rays[image.index()] {
-                        poles[image.index()] += rays.bearings[feature as usize];
+                        middles[image.index()] += rays.bearings[feature as usize];
                     }
                 }
             }
         }
-        (!one_sided.is_empty()).then_some(Self { input, rays, one_sided, poles })
+        let down = |middle: &Vector3<f64>| if middle.norm() > 0.0 { Vector3::y() } else { Vector3::zeros() };
+        let downs = middles.iter().map(down).collect();
+        is_one_sided.contains(&true).then_some(Self { input, rays, is_one_sided, middles, downs })
+    }
+
+    /// The pairs that explain what lies underfoot only, or those that do not.
+    fn pairs(&self, one_sided: bool) -> impl Iterator<Item = &'a PairGeometry> {
+        let judged = self.input.pairs.iter().zip(&self.is_one_sided);
+        judged.filter(move |(_, is_one_sided)| **is_one_sided == one_sided).map(|(pair, _)| pair)
     }
 
     /// What the model ought to be made of in place of all, and what to say of it; `None` where nothing speaks against
@@ -120,37 +138,64 @@ impl<'a> Underfoot<'a> {
     /// On a floor of exactly repeated tiles each panorama matches the tiles under any other as if it stood a whole number
     /// of tiles away: all fall together within one tile, and agree on it. The walls around contradict, but are
     /// outvoted, and the floor's matches are not told from right ones one by one. Where the walls contradict the whole
-    /// model, none of the floor's matches counts. Where the model contradicts the floor's pairs, these count for nothing
-    /// with images that the floor alone holds. A floor that is right agrees with the walls.
+    /// model, none of the floor's matches counts at first. Where the model contradicts the floor's pairs, these count for
+    /// nothing with images that the floor alone holds. A floor that is right agrees with the walls, and comes back once
+    /// they hold the model ([`Self::borne_out`]). What judges is farther from the floor's matches than what maps: it needs no
+    /// walls on every side, but a floor beyond the cone that agrees with itself would speak for the fold.
     pub fn better_input(&self, components: &[Reconstruction], seed: u64) -> Option<(Remainder, String)> {
         if self.share() > MIN_REPEATED_SHARE {
-            let rest = self.left_out(|_| true, seed);
-            if agreement(rest.pairs.iter(), components).is_some_and(|share| share < MIN_AGREEMENT) {
-                return Some((rest, WARNING.to_owned()));
+            let judging = self.left_out(&self.middles, |_| true, seed);
+            if agreement(judging.pairs.iter(), components).is_some_and(|share| share < MIN_AGREEMENT) {
+                return Some((self.left_out(&self.downs, |_| true, seed), WARNING.to_owned()));
             }
         }
-        agreement(self.one_sided.iter().copied(), components).filter(|share| *share < MIN_AGREEMENT)?;
+        agreement(self.pairs(true), components).filter(|share| *share < MIN_AGREEMENT)?;
         let held = self.held_underfoot(components);
         if held.is_empty() {
             return None;
         }
         let names: Vec<&str> = held.iter().map(|image| self.input.images[image.index()].name).collect();
         let warning = format!(
-            "the floor repeats itself, and nothing else held {}: what lies underfoot was left out there",
+            "the floor repeats itself, and nothing else held {}: what lies underfoot counts there only where the rest agrees",
             names.join(", ")
         );
-        Some((self.left_out(|image| held.contains(&image), seed), warning))
+        Some((self.left_out(&self.downs, |image| held.contains(&image), seed), warning))
+    }
+
+    /// The pairs that count once the walls hold a model: those that explain more than what lies underfoot, and of images
+    /// whose poses are known those only that the poses bear out.
+    pub fn borne_out(&self, parts: &[Part]) -> Vec<PairGeometry> {
+        let is_borne_out = |pair: &&PairGeometry| {
+            let placed = second_from_first(pair, parts.iter().map(|part| &part.component));
+            let rays = both(&self.rays, pair.first, pair.second);
+            let Some((placed, rays)) = placed.zip(rays) else { return true };
+            let matches = &pair.two_view.inliers;
+            let agreeing = count_on_circles(rays, &placed, matches, self.input.two_view.max_error_sigma);
+            agreeing as f64 >= MIN_AGREEMENT * matches.len() as f64
+        };
+        self.pairs(false).filter(is_borne_out).cloned().collect()
+    }
+
+    /// What these pairs say of poses by what lies elsewhere.
+    pub fn witnesses(&self, pairs: &[PairGeometry]) -> Witnesses {
+        let elsewhere = (self.input.images.iter().enumerate())
+            .map(|(image, source)| {
+                let features = 0..source.features.len() as u32;
+                features.map(|feature| !self.is_near(&self.downs, ImageId(image as u32), feature)).collect()
+            })
+            .collect();
+        Witnesses::new(pairs, elsewhere)
     }
 
     /// Share of all verified matches that lie in one-sided geometries.
     fn share(&self) -> f64 {
         let all: usize = self.input.pairs.iter().map(|pair| pair.two_view.inliers.len()).sum();
-        let count: usize = self.one_sided.iter().map(|pair| pair.two_view.inliers.len()).sum();
+        let count: usize = self.pairs(true).map(|pair| pair.two_view.inliers.len()).sum();
         count as f64 / all.max(1) as f64
     }
 
-    fn is_repeated(&self, image: ImageId, feature: u32) -> bool {
-        let pole: &Vector3<f64> = &self.poles[image.index()];
+    fn is_near(&self, poles: &[Vector3<f64>], image: ImageId, feature: u32) -> bool {
+        let pole = &poles[image.index()];
         let bearing = self.rays[image.index()].as_ref().map(|rays| rays.bearings[feature as usize]);
         bearing.is_some_and(|bearing| bearing.dot(pole) > MAX_REPEATED_DEG.to_radians().cos() * pole.norm())
     }
@@ -161,7 +206,8 @@ impl<'a> Underfoot<'a> {
         for component in components {
             let mut counts = vec![[0_usize; 2]; component.images.len()];
             for seen in component.points.iter().flat_map(|point| &point.track) {
-                counts[seen.image.index()][usize::from(self.is_repeated(seen.image, seen.feature))] += 1;
+                counts[seen.image.index()]
+                    [usize::from(self.is_near(&self.middles, seen.image, seen.feature))] += 1;
             }
             let is_held = |image: &ImageId| {
                 let [elsewhere, underfoot] = counts[image.index()];
@@ -172,8 +218,13 @@ impl<'a> Underfoot<'a> {
         held
     }
 
-    /// All matches and pairs, but in pairs with such images without what lies underfoot, and verified again.
-    fn left_out(&self, concerns: impl Fn(ImageId) -> bool + Sync, seed: u64) -> Remainder {
+    /// All matches and pairs, but in pairs with such images without what lies near the poles, and verified again.
+    fn left_out(
+        &self,
+        poles: &[Vector3<f64>],
+        concerns: impl Fn(ImageId) -> bool + Sync,
+        seed: u64,
+    ) -> Remainder {
         let is_concerned = |first: ImageId, second: ImageId| concerns(first) || concerns(second);
         let verified: Vec<(PutativePair, Vec<PairGeometry>)> = (self.input.putative)
             .par_iter()
@@ -183,8 +234,9 @@ impl<'a> Underfoot<'a> {
             .map(|(at, pair)| {
                 let PutativePair { first, second, .. } = *pair;
                 let mut left = pair.clone();
-                left.matches
-                    .retain(|m| !self.is_repeated(first, m.first) && !self.is_repeated(second, m.second));
+                left.matches.retain(|m| {
+                    !self.is_near(poles, first, m.first) && !self.is_near(poles, second, m.second)
+                });
                 let seed = seed.wrapping_add(at as u64);
                 let geometries = both(&self.rays, first, second)
                     .map(|[a, b]| verify_pair(&self.input.two_view, a, b, &left.matches, seed));
