@@ -34,7 +34,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 9;
+pub const ALIGNMENT_VERSION: u32 = 10;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;
@@ -189,6 +189,32 @@ fn in_each<T: Send, E: Send>(
     found.into_iter().collect()
 }
 
+/// The frame of a patch by where its steps (x, y) lie, to the second order, from the places `reach` steps from its middle;
+/// `full_turn_px` where the image closes round it.
+pub(crate) fn second_order(
+    place: impl Fn(f64, f64) -> Option<Vector2<f64>>,
+    reach: f64,
+    full_turn_px: Option<f64>,
+) -> Option<PatchFrame> {
+    let center = place(0.0, 0.0)?;
+    let from_middle = |x: f64, y: f64| {
+        let mut offset = place(x, y)? - center;
+        if let Some(turn) = full_turn_px {
+            offset.x -= turn * (offset.x / turn).round();
+        }
+        Some(offset)
+    };
+    let h = reach;
+    let [left, right] = [from_middle(-h, 0.0)?, from_middle(h, 0.0)?];
+    let [above, below] = [from_middle(0.0, -h)?, from_middle(0.0, h)?];
+    let (along_x, along_y) = (right + left, below + above);
+    let mixed = 0.5 * (from_middle(h, h)? + from_middle(-h, -h)? - along_x - along_y);
+    let curvature =
+        [0, 1].map(|axis| Matrix2::new(along_x[axis], mixed[axis], mixed[axis], along_y[axis]) / (h * h));
+    let pixel_from_patch = Matrix2::from_columns(&[right - left, below - above]) / (2.0 * h);
+    Some(PatchFrame { center, pixel_from_patch, curvature })
+}
+
 /// Whether two images have one centre, as photos turned on the spot do.
 fn shares_standpoints(component: &Reconstruction, registered: &[ImageId]) -> bool {
     let mut centers: Vec<[f64; 3]> = registered
@@ -284,20 +310,8 @@ impl<'a> Tracks<'a> {
             let on_plane = self.planes[point] * Vector2::new(x, y) * spacing;
             camera.project(&camera_from_world.transform_point(&(position + on_plane)))
         };
-        let middle = place(0.0, 0.0)?;
-        let from_middle = |x: f64, y: f64| {
-            let mut offset = place(x, y)? - middle;
-            if let Some(turn) = camera.full_turn_px() {
-                offset.x -= turn * (offset.x / turn).round();
-            }
-            Some(offset)
-        };
-        let h = 0.5 * self.params.patch.radius as f64;
-        let along_x = from_middle(h, 0.0)? + from_middle(-h, 0.0)?;
-        let along_y = from_middle(0.0, h)? + from_middle(0.0, -h)?;
-        let mixed = 0.5 * (from_middle(h, h)? + from_middle(-h, -h)? - along_x - along_y);
-        let curvature =
-            [0, 1].map(|axis| Matrix2::new(along_x[axis], mixed[axis], mixed[axis], along_y[axis]) / (h * h));
+        let reach = 0.5 * self.params.patch.radius as f64;
+        let PatchFrame { curvature, .. } = second_order(place, reach, camera.full_turn_px())?;
         Some(PatchFrame { center, pixel_from_patch: pixel_from_plane * spacing, curvature })
     }
 

@@ -9,6 +9,7 @@ mod alignment;
 pub mod bundle;
 mod geometry;
 mod georegister;
+mod ground;
 mod mapper;
 mod quality;
 mod reconstruction;
@@ -21,6 +22,7 @@ mod visibility;
 pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, align_tracks};
 pub use geometry::{Rigid, Similarity};
 pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, georegister};
+pub use ground::sharpen_lengths;
 pub use mapper::{
     InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,
     MergeVerdict, Mosaic, PutativePair, RegistrationRecord, reconstruct,

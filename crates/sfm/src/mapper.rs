@@ -10,7 +10,7 @@ mod initial;
 mod merge;
 mod model;
 mod nearby;
-mod plane;
+pub(crate) mod plane;
 mod projection;
 mod register;
 mod repeated;
@@ -30,6 +30,7 @@ use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, ImageFeatures, Match};
 
 pub(crate) use self::adjust::MIN_ADJUSTABLE_POINTS;
+pub(crate) use self::corner::ln_false_alarms;
 pub use self::{
     merge::{MergeRecord, MergeVerdict},
     standpoint::Mosaic,
@@ -59,7 +60,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 20;
+pub const MAPPER_VERSION: u32 = 21;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -354,11 +355,19 @@ fn finished(
     params: &MapperParams,
     input: &MapperInput<'_>,
     parts: Vec<Part>,
-    report: MapperReport,
+    mut report: MapperReport,
     seed: u64,
 ) -> MapperOutput {
-    let parts = parts.into_iter().map(|part| seen_again(params, input, part, seed));
-    MapperOutput { components: parts.map(|part| part.component).collect(), report }
+    let mut components = Vec::new();
+    for part in parts {
+        let (component, unheld) = seen_again(params, input, part, seed).without_unheld();
+        for image in unheld {
+            let name = &component.images[image.index()].name;
+            report.warnings.push(format!("{name} is left out: next to no point of the model holds it"));
+        }
+        components.push(component);
+    }
+    MapperOutput { components, report }
 }
 
 /// The part with further observations of its points, where images have few.
@@ -383,6 +392,38 @@ struct Part {
     component: Reconstruction,
     anchors: Anchors,
 }
+
+impl Part {
+    /// The component without the poses of images that fewer than [`MIN_HELD_POINTS`] points hold, and these images.
+    ///
+    /// Points that later disagreed are gone then, and the pose is where it was when they did not; photos matched with
+    /// such an image were localized at wrong places. Images that were turned from another one are held by it.
+    fn without_unheld(mut self) -> (Reconstruction, Vec<ImageId>) {
+        let mut points_of = vec![0_usize; self.component.images.len()];
+        for seen in self.component.points.iter().flat_map(|point| &point.track) {
+            points_of[seen.image.index()] += 1;
+        }
+        let is_turned = |image: ImageId| (self.anchors.iter().flatten()).any(|(from, _)| *from == image);
+        let held = |image: ImageId| {
+            points_of[image.index()] >= MIN_HELD_POINTS
+                || self.anchors[image.index()].is_some()
+                || is_turned(image)
+                || self.component.lengths.iter().any(|length| length.involves(image))
+        };
+        let unheld: Vec<ImageId> = self.component.registered().filter(|image| !held(*image)).collect();
+        for image in &unheld {
+            self.component.images[image.index()].world_from_camera = None;
+            for point in &mut self.component.points {
+                point.track.retain(|seen| seen.image != *image);
+            }
+        }
+        self.component.points.retain(|point| point.track.len() >= 2);
+        (self.component, unheld)
+    }
+}
+
+/// Fewest points that hold an image: three give a pose, a fourth contradicts a wrong one.
+const MIN_HELD_POINTS: usize = 4;
 
 /// The pairs of which no image is taken.
 fn enabled_pairs(input: &MapperInput<'_>, taken: &[bool]) -> Vec<bool> {

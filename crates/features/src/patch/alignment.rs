@@ -89,7 +89,7 @@ impl PatchFrame {
     }
 
     /// Pixels that one step spans: the geometric mean over all directions.
-    fn spacing(&self) -> f64 {
+    pub fn spacing(&self) -> f64 {
         self.pixel_from_patch.determinant().abs().sqrt()
     }
 }
@@ -217,6 +217,14 @@ impl Template {
         let shift_variance = (shift * spread * shift.transpose()).trace();
         let variance = curvature[(6, 6)];
         Some(Self { params: *params, radius, samples, mean, variance, inverse, shift_variance })
+    }
+
+    /// How the image at `frame` correlates with the template as it is; `None` where it leaves the image.
+    pub fn correlation(&self, pyramid: &ImagePyramid, frame: &PatchFrame) -> Option<f64> {
+        let grid = frame.grid(&Matrix2::identity(), &Vector2::zeros());
+        let mut samples = Samples::default();
+        let inside = pyramid.sample(pyramid.level_for(frame.spacing()), &grid, self.radius, &mut samples);
+        inside.then(|| self.fit(&window(self.radius), &samples.values).correlation)
     }
 
     /// Finds the template near the middle of `frame`, which also gives the expected shape; `None` where it is not.

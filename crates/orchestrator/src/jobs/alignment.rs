@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use anyhow::{Context, Result};
 use serde_json::json;
 use setloc_features::ImageFeatures;
-use setloc_sfm::{AlignmentParams, MapperOutput, align_tracks};
+use setloc_sfm::{AlignmentParams, MapperOutput, align_tracks, sharpen_lengths};
 
 use super::model::{features_role, image_of_place_holder, read_unchanged};
 use crate::dataset::SourceImage;
@@ -83,6 +83,9 @@ fn run_alignment(
             .collect();
         let pyramids = Pyramids::default();
         let report = align_tracks(params, component, &features, camera_fixed, |image| {
+            pyramids.get(&sources[image_at[image.index()]], wraps[image.index()])
+        })?;
+        sharpen_lengths(component, |image| {
             pyramids.get(&sources[image_at[image.index()]], wraps[image.index()])
         })?;
         if report.aligned * 5 < report.sought {

@@ -1,6 +1,6 @@
 //! Planes among the points that one image sees.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -8,7 +8,7 @@ use crate::solvers::triangulation::WorldRay;
 
 /// A point as an image sees it.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct SeenPoint {
+pub(crate) struct SeenPoint {
     /// From the image's centre.
     pub position: Vector3<f64>,
     /// What the noise of the rays leaves open.
@@ -38,7 +38,7 @@ impl SeenPoint {
 
 /// A plane and the points that lie on it.
 #[derive(Debug, Clone)]
-pub(super) struct Plane {
+pub(crate) struct Plane {
     /// Unit normal, away from the image's centre.
     pub normal: Vector3<f64>,
     /// Distance from the image's centre.
@@ -62,6 +62,31 @@ impl Plane {
     /// Standard deviation of the normal in radians, in the direction in which it is known worst.
     pub fn normal_sigma(&self) -> f64 {
         self.slope_variances[0].max(self.slope_variances[1]).sqrt()
+    }
+
+    /// Standard deviations of its two slopes, and of its height at the middle of its points.
+    pub fn sigmas(&self) -> Vector3<f64> {
+        let [first, second] = self.slope_variances;
+        Vector3::new(first, second, self.height_variance).map(f64::sqrt)
+    }
+
+    /// The same in a frame turned about the image's centre.
+    #[must_use]
+    pub fn turned(self, rotation: &UnitQuaternion<f64>) -> Self {
+        Self {
+            normal: rotation * self.normal,
+            centroid: rotation * self.centroid,
+            tangents: self.tangents.map(|along| rotation * along),
+            ..self
+        }
+    }
+
+    /// Normal and distance of the plane with other slopes about the middle of its points, and raised there.
+    pub fn moved(&self, by: &Vector3<f64>) -> (Vector3<f64>, f64) {
+        let slope = self.tangents[0] * by.x + self.tangents[1] * by.y;
+        let normal = self.normal - slope;
+        let distance = self.distance + by.z - slope.dot(&self.centroid);
+        (normal / normal.norm(), distance / normal.norm())
     }
 
     /// Standard deviation of the height at a place on the plane, as a share of the plane's distance.
@@ -94,7 +119,7 @@ const ALIKE: f64 = 10.0;
 ///
 /// Nearness of the points that make a sample is that of their directions: depths may be poor. Distances from a plane are
 /// judged by the noise of each point's rays.
-pub(super) fn find_planes(points: &[SeenPoint], min_points: usize, seed: u64) -> Vec<Plane> {
+pub(crate) fn find_planes(points: &[SeenPoint], min_points: usize, seed: u64) -> Vec<Plane> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let directions: Vec<Vector3<f64>> = points.iter().map(|point| point.position.normalize()).collect();
     let mut left: Vec<usize> = (0..points.len()).collect();
@@ -249,6 +274,18 @@ mod tests {
         assert!(planes[0].relative_sigma(&far) > 5.0 * planes[0].relative_sigma(&near));
         let error = (planes[0].normal.dot(&far) / planes[0].distance - 1.0).abs();
         assert!(error < 3.0 * planes[0].relative_sigma(&far), "{error}");
+    }
+
+    #[test]
+    fn a_moved_plane_has_the_slopes_and_the_height_it_is_given() {
+        let plane = &find_planes(&walls(0.0, 0, "moved"), 50, 7)[0];
+        let (normal, distance) = plane.moved(&Vector3::new(0.02, -0.01, 0.3));
+        let height = |position: &Vector3<f64>| normal.dot(position) - distance;
+        assert!((normal.norm() - 1.0).abs() < 1e-12);
+        let length = (1.0_f64 + 0.02_f64.powi(2) + 0.01_f64.powi(2)).sqrt();
+        assert!((height(&plane.centroid) * length + 0.3).abs() < 1e-9);
+        let along = height(&(plane.centroid + plane.tangents[0])) - height(&plane.centroid);
+        assert!((along * length + 0.02).abs() < 1e-9);
     }
 
     #[test]

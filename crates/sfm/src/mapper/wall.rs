@@ -247,7 +247,7 @@ impl WallPair {
     }
 
     /// Rotation in the second image's axes and shift of its centre to another pose.
-    fn shift_to(&self, other: &Self) -> SVector<f64, 6> {
+    pub fn shift_to(&self, other: &Self) -> SVector<f64, 6> {
         let turn = Rigid::from_matrix(&(self.rotation * other.rotation.transpose()), Vector3::zeros());
         let (turn, shift) = (turn.rotation.scaled_axis(), other.center() - self.center());
         SVector::from([turn.x, turn.y, turn.z, shift.x, shift.y, shift.z])

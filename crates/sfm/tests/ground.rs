@@ -1,0 +1,172 @@
+//! Poses round corners by the ground, on rendered paving with exact truth.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+
+use nalgebra::{Matrix6, UnitQuaternion, Vector2, Vector3};
+use setloc_features::{Camera, DecodedImage, ImagePyramid};
+use setloc_sfm::{
+    BaselineLength, CameraId, ImageId, Observation, Reconstruction, ReconstructionImage, ReconstructionPoint,
+    Rigid, sharpen_lengths,
+};
+
+/// Height of the cameras over the ground, and steps along the street.
+const HEIGHT: f64 = 1.6;
+const STEP: f64 = 4.0;
+/// What is known of the last pose: standard deviations in radians and metres.
+const SIGMAS: [f64; 6] = [0.004, 0.004, 0.002, 0.15, 0.1, 0.12];
+
+/// A number in [0, 1) of a cell of the ground.
+fn cell(x: i64, y: i64, salt: u64) -> f64 {
+    let mut state =
+        (x as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (y as u64).wrapping_mul(0xC2B2_AE3D_27D4_EB4F);
+    state ^= salt.wrapping_mul(0x1656_67B1_9E37_79F9);
+    state = (state ^ (state >> 29)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    state ^= state >> 32;
+    (state >> 11) as f64 / (1_u64 << 53) as f64
+}
+
+/// Grey value of square stones with joints between them, of another size for each salt.
+fn paving(x: f64, z: f64, salt: u64) -> f64 {
+    let size = 0.3 + 0.07 * salt as f64;
+    let (u, v) = (x / size, z / size);
+    let joint = [u, v].iter().any(|place| place - place.floor() < 0.1);
+    let stone = cell(u.floor() as i64, v.floor() as i64, salt);
+    if joint { 40.0 } else { 90.0 + 120.0 * stone }
+}
+
+/// What a camera sees of the ground y = `HEIGHT`, the sky grey.
+fn render(camera: &Camera, world_from_camera: &Rigid, salt: u64) -> Arc<ImagePyramid> {
+    let value = |pixel: &Vector2<f64>| {
+        let ray = world_from_camera.rotation * camera.unproject(pixel).expect("a pinhole inverts everywhere");
+        if ray.y < 0.01 {
+            return 128.0;
+        }
+        let met = world_from_camera.translation + ray * ((HEIGHT - world_from_camera.translation.y) / ray.y);
+        paving(met.x, met.z, salt)
+    };
+    let offsets = [-0.375, -0.125, 0.125, 0.375];
+    let pixels = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+    let rgb = pixels.flat_map(|(x, y)| {
+        let middle = Vector2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+        let samples = offsets.iter().flat_map(|dy| offsets.map(|dx| middle + Vector2::new(dx, *dy)));
+        let mean = samples.map(|pixel| value(&pixel)).sum::<f64>() / 16.0;
+        [mean.round() as u8; 3]
+    });
+    Arc::new(ImagePyramid::new(
+        &DecodedImage::from_rgb(camera.width, camera.height, rgb.collect())
+            .expect("as many values as pixels"),
+        false,
+    ))
+}
+
+/// Four photos along a street of which the last hangs on a length.
+struct Street {
+    truth: Vec<Rigid>,
+    component: Reconstruction,
+    images: Vec<Arc<ImagePyramid>>,
+}
+
+impl Street {
+    /// The last photo shows other paving where `salts` differ.
+    fn new(salts: [u64; 2]) -> Self {
+        let camera = Camera::from_focal_guess(640, 480, 420.0);
+        let pose = |at: usize| {
+            let (along, turn) = (at as f64, if at == 3 { 0.4 } else { 0.05 * at as f64 });
+            let rotation = UnitQuaternion::from_euler_angles(-0.02, turn, 0.01 * along);
+            Rigid::new(rotation, Vector3::new(0.1 * along, 0.03 * along, STEP * along))
+        };
+        let truth: Vec<Rigid> = (0..4).map(pose).collect();
+        let images =
+            truth.iter().enumerate().map(|(at, pose)| render(&camera, pose, salts[at / 3])).collect();
+        let shared = |number: u32| ReconstructionPoint {
+            position: Vector3::new(-5.0, -1.0, 10.0 + f64::from(number)),
+            color: [0; 3],
+            error_sigma: 1.0,
+            covariance: None,
+            track: (0..3).map(|image| Observation { image: ImageId(image), feature: number }).collect(),
+            aligned: None,
+        };
+        let error = [0.7, -0.8, 0.5, -1.0, 0.6, 0.8];
+        let shift = Vector3::from([3, 4, 5].map(|axis| error[axis] * SIGMAS[axis]));
+        let turn = Vector3::from([0, 1, 2].map(|axis| error[axis] * SIGMAS[axis]));
+        let exact = truth[2].inverse() * truth[3];
+        let known =
+            Rigid::new(exact.rotation * UnitQuaternion::from_scaled_axis(turn), exact.translation + shift);
+        let baseline = (truth[2].translation - truth[1].translation).norm();
+        let mut covariance = Matrix6::from_diagonal(&SIGMAS.map(|sigma| sigma * sigma).into());
+        covariance.fixed_view_mut::<3, 3>(3, 3).scale_mut(baseline.powi(-2));
+        let length = BaselineLength {
+            reference: ImageId(1),
+            from: ImageId(2),
+            to: ImageId(3),
+            ratio: known.translation.norm() / baseline,
+            deviation: 0.03,
+            votes: 10,
+            pose: Rigid::new(known.rotation, known.translation / baseline),
+            covariance,
+        };
+        let image = |(at, pose): (usize, &Rigid)| ReconstructionImage {
+            name: format!("{at}.jpg"),
+            camera: CameraId(0),
+            world_from_camera: Some(if at == 3 { truth[2] * known } else { *pose }),
+        };
+        let component = Reconstruction {
+            cameras: vec![camera],
+            images: truth.iter().enumerate().map(image).collect(),
+            points: (0..12).map(shared).collect(),
+            lengths: vec![length],
+        };
+        Self { truth, component, images }
+    }
+
+    fn sharpen(&mut self) -> usize {
+        let images = &self.images;
+        let load = |image: ImageId| Ok::<_, Infallible>(Arc::clone(&images[image.index()]));
+        sharpen_lengths(&mut self.component, load).unwrap()
+    }
+
+    /// Error of the last pose in its frame, in radians and metres, and its square in stated deviations per coordinate.
+    fn error(&self) -> (f64, f64, f64) {
+        let length = &self.component.lengths[0];
+        let baseline = (self.truth[2].translation - self.truth[1].translation).norm();
+        let exact = self.truth[2].inverse() * self.truth[3];
+        let turn = (exact.rotation.inverse() * length.pose.rotation).scaled_axis();
+        let shift = length.pose.translation - exact.translation / baseline;
+        let error = nalgebra::Vector6::new(turn.x, turn.y, turn.z, shift.x, shift.y, shift.z);
+        let squared = error.dot(&(length.covariance.try_inverse().expect("a covariance") * error)) / 6.0;
+        (turn.norm(), shift.norm() * baseline, squared)
+    }
+}
+
+#[test]
+fn paving_that_both_photos_show_sharpens_the_pose() {
+    let mut street = Street::new([0, 0]);
+    let before = street.error();
+    assert_eq!(street.sharpen(), 1);
+    let after = street.error();
+    assert!(after.0 < 0.3 * before.0 && after.0 < 0.002, "{before:?} {after:?}");
+    assert!(after.1 < 0.5 * before.1 && after.1 < 0.08, "{before:?} {after:?}");
+    assert!(after.2 < 3.0, "{after:?}");
+    let length = &street.component.lengths[0];
+    let baseline = (street.truth[2].translation - street.truth[1].translation).norm();
+    assert!((length.ratio - length.pose.translation.norm()).abs() < 1e-9 && length.votes > 10 + 12);
+    assert!((length.ratio * baseline - STEP).abs() < 0.1);
+}
+
+#[test]
+fn other_paving_changes_nothing() {
+    let mut street = Street::new([0, 1]);
+    let before = street.component.clone();
+    assert_eq!(street.sharpen(), 0);
+    assert_eq!(street.component, before);
+}
+
+#[test]
+fn what_cannot_be_loaded_is_said_and_changes_nothing() {
+    let mut street = Street::new([0, 0]);
+    let before = street.component.clone();
+    let failed = sharpen_lengths(&mut street.component, Err::<Arc<ImagePyramid>, _>);
+    assert!(failed.is_err());
+    assert_eq!(street.component, before);
+}
