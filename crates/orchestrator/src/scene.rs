@@ -78,6 +78,17 @@ impl SceneFile {
         self.grown.iter().filter_map(|grown| Some(images.get(grown.image.index())?.name.as_str())).collect()
     }
 
+    /// Names of the images that no component has a pose of.
+    pub fn unregistered(&self) -> Vec<&str> {
+        let images = self.main().map_or(&[][..], |main| &main.images);
+        let is_nowhere = |at: &usize| {
+            let poses =
+                self.components.iter().filter_map(|component| component.images.get(*at)?.world_from_camera);
+            poses.count() == 0
+        };
+        (0..images.len()).filter(is_nowhere).map(|at| images[at].name.as_str()).collect()
+    }
+
     /// The largest component.
     pub fn main(&self) -> Option<&Reconstruction> {
         self.components.first()

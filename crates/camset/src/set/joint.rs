@@ -798,11 +798,14 @@ impl Component<'_> {
             seen[slot] += 1;
         }
         let spread = &rigid.observability;
+        // One photo has no scale, nor has a set of which the rays tell none.
+        let scale =
+            spread.log_scale.is_finite().then(|| format!(", scale ± {:.1} %", 100.0 * spread.log_scale));
         let precision = format!(
-            "as a rigid set: rotation ± {:.2}°, position ± {:.1} % of the viewing distance, scale ± {:.1} %",
+            "as a rigid set: rotation ± {:.2}°, position ± {:.1} % of the viewing distance{}",
             spread.rotation_rad.to_degrees(),
             100.0 * spread.position,
-            100.0 * spread.log_scale
+            scale.unwrap_or_default()
         );
         (0..self.members.len())
             .map(|slot| PhotoLocalization {

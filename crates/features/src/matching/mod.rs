@@ -98,7 +98,7 @@ impl Default for MatchParams {
             mutual: true,
             max_distance: 1.0,
             screen_features: 2048,
-            screen_matches: 28,
+            screen_matches: 10,
             simulate_below: 300,
         }
     }

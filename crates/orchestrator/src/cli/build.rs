@@ -38,6 +38,7 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     let folder = read_sources(&args.source)?;
     let output = &args.source.output;
     let export = args.export.clone().unwrap_or_else(|| export_folder(output));
+    refuse_input_folder(&args.source.panoramas, &export)?;
     let session = args.source.run.session(output, Some(&export))?;
     let name = session.store.name_of("build", output);
     let present = std::fs::read(output).ok().map(|bytes| ContentHash::of(&bytes));
@@ -129,6 +130,19 @@ fn stored_alike_pairs(
     }
     let session = args.source.run.session(&args.source.output, None)?;
     Ok(alike_pairs(&session, name, &folder.images, &config.features, config)?.0)
+}
+
+/// What is exported beside images would be read as images by the next build.
+fn refuse_input_folder(inputs: &[PathBuf], export: &Path) -> Result<()> {
+    let Ok(export_at) = export.canonicalize() else { return Ok(()) };
+    let is_export = |input: &&PathBuf| input.canonicalize().is_ok_and(|input| input == export_at);
+    match inputs.iter().find(is_export) {
+        Some(input) => Err(Hinted::error(
+            format!("the exports would go into {}, among the images", input.display()),
+            "name the scene otherwise, or a folder for its exports with --export",
+        )),
+        None => Ok(()),
+    }
 }
 
 /// The scene whose exports are in a folder.
@@ -231,6 +245,10 @@ pub fn summarize(scene: &SceneFile, images: usize) {
             model.observation_count()
         )),
         None => print::note(&format!("scene: 0/{images} images could be registered")),
+    }
+    let unregistered = scene.unregistered();
+    if !unregistered.is_empty() {
+        print::note(&format!("not registered: {}", unregistered.join(", ")));
     }
     for note in &scene.notes {
         print::note(&format!("note: {note}"));

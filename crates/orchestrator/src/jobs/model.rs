@@ -333,7 +333,7 @@ fn run_model(
             let images: Vec<&str> =
                 component.registered().map(|image| component.images[image.index()].name.as_str()).collect();
             output.report.warnings.push(format!(
-                "component {} is apart from the largest: {}",
+                "component {} is apart from the largest, in which alone photos are localized: {}",
                 at + 1,
                 images.join(", ")
             ));
