@@ -938,3 +938,42 @@ impl<'a> Mapper<'a> {
         found
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{ReconstructionImage, ReconstructionPoint};
+
+    #[test]
+    fn images_that_next_to_no_point_holds_lose_their_pose_and_others_keep_theirs() {
+        let image = |number: u32| ReconstructionImage {
+            name: number.to_string(),
+            camera: CameraId(0),
+            world_from_camera: Some(Rigid::new(UnitQuaternion::identity(), Vector3::x() * f64::from(number))),
+        };
+        let point = |feature: u32, images: &[u32]| ReconstructionPoint {
+            position: Vector3::z(),
+            color: [0; 3],
+            error_sigma: 1.0,
+            covariance: None,
+            track: images.iter().map(|&image| Observation { image: ImageId(image), feature }).collect(),
+            aligned: None,
+        };
+        // Three points hold the third image, none the fourth, which was turned from the first.
+        let points = (0..6).map(|feature| point(feature, if feature < 2 { &[0, 1, 2] } else { &[0, 1] }));
+        let points: Vec<_> = points.chain([point(6, &[1, 2])]).collect();
+        let component = Reconstruction {
+            cameras: vec![Camera::equirectangular(200, 100)],
+            images: (0..4).map(image).collect(),
+            points,
+            lengths: Vec::new(),
+        };
+        let mut anchors = vec![None; 4];
+        anchors[3] = Some((ImageId(0), UnitQuaternion::identity()));
+        let (component, unheld) = Part { component, anchors }.without_unheld();
+        assert_eq!(unheld, [ImageId(2)]);
+        assert_eq!(component.registered().collect::<Vec<_>>(), [0, 1, 3].map(ImageId));
+        assert_eq!(component.points.len(), 6);
+        assert!(component.points.iter().all(|point| point.track.len() == 2));
+    }
+}

@@ -248,7 +248,7 @@ pub fn summarize(scene: &SceneFile, images: usize) {
     }
     let unregistered = scene.unregistered();
     if !unregistered.is_empty() {
-        print::note(&format!("not registered: {}", unregistered.join(", ")));
+        print::note(&format!("not registered: {}", listed(&unregistered)));
     }
     for note in &scene.notes {
         print::note(&format!("note: {note}"));
@@ -258,6 +258,16 @@ pub fn summarize(scene: &SceneFile, images: usize) {
     }
 }
 
+/// Most names in a line.
+const MOST_NAMED: usize = 20;
+
+/// Names in a line, and how many more there are.
+fn listed(names: &[&str]) -> String {
+    let (named, rest) = names.split_at(names.len().min(MOST_NAMED));
+    let others = if rest.is_empty() { String::new() } else { format!(" and {} others", rest.len()) };
+    format!("{}{others}", named.join(", "))
+}
+
 /// Says which images were left out.
 pub fn warn_skipped(skipped: &[SkippedImage]) {
     for image in skipped {
@@ -265,5 +275,32 @@ pub fn warn_skipped(skipped: &[SkippedImage]) {
     }
     if !skipped.is_empty() {
         print::note(&format!("{} images skipped", skipped.len()));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::slice;
+
+    use super::*;
+
+    #[test]
+    fn exports_among_the_images_are_refused() {
+        let root = tempfile::tempdir().unwrap();
+        let street = root.path().join("street");
+        std::fs::create_dir(&street).unwrap();
+        let refused = refuse_input_folder(slice::from_ref(&street), &root.path().join("street/../street"));
+        let text = format!("{:#}", refused.unwrap_err());
+        assert!(text.contains("street") && text.contains("among the images"), "{text}");
+        refuse_input_folder(slice::from_ref(&street), &street.join("exports")).unwrap();
+        refuse_input_folder(&[street], root.path()).unwrap();
+    }
+
+    #[test]
+    fn long_lists_of_names_are_cut() {
+        let names: Vec<String> = (0..23).map(|number| format!("{number}.jpg")).collect();
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        assert_eq!(listed(&names[..2]), "0.jpg, 1.jpg");
+        assert!(listed(&names).ends_with("18.jpg, 19.jpg and 3 others"));
     }
 }
