@@ -14,7 +14,6 @@ mod sight;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nalgebra::Matrix6;
 use setloc_features::{ImagePyramid, PatchParams};
 
 use self::{floor::Floor, sight::View};
@@ -88,30 +87,10 @@ impl<'a> Corner<'a> {
             .filter_map(|[first, second]| Some([self.views.get(first)?, self.views.get(second)?]))
             .collect();
         let floor = Floor::find(&pairs, from, self.baseline)?;
-        let scale = of_positions(self.baseline);
-        let mut pose = self.length.pose;
-        pose.translation *= self.baseline;
-        let covariance = scale * self.length.covariance * scale;
+        let (pose, covariance) = self.length.at_baseline(self.baseline);
         let found = corner::find([from, to], (&pose, &covariance), &floor)?;
-        let mut pose = found.first_from_second;
-        let (step, along) = (pose.translation.norm(), pose.translation.try_normalize(0.0)?);
-        let variance = along.dot(&(found.covariance.fixed_view::<3, 3>(3, 3) * along));
-        let scale = of_positions(self.baseline.recip());
-        pose.translation /= self.baseline;
-        Some(BaselineLength {
-            ratio: step / self.baseline,
-            deviation: variance.max(0.0).sqrt() / step,
-            votes: self.length.votes + found.patches,
-            pose,
-            covariance: scale * found.covariance * scale,
-            ..*self.length
-        })
+        let BaselineLength { reference, from, to, votes, .. } = *self.length;
+        let pose = (found.first_from_second, &found.covariance);
+        BaselineLength::of_step([reference, from, to], pose, self.baseline, votes + found.patches)
     }
-}
-
-/// Scales the last three of rotation and position.
-fn of_positions(factor: f64) -> Matrix6<f64> {
-    let mut scale = Matrix6::identity();
-    scale.fixed_view_mut::<3, 3>(3, 3).scale_mut(factor);
-    scale
 }

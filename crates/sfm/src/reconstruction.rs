@@ -108,6 +108,36 @@ pub struct BaselineLength {
 }
 
 impl BaselineLength {
+    /// The length of the step from `from` to `to`, with their pose in units of the model, its covariance (rotation about
+    /// the axes of `to`, then the centre) and the reference baseline's length; `None` without a step.
+    pub(crate) fn of_step(
+        [reference, from, to]: [ImageId; 3],
+        (from_to, covariance): (Rigid, &Matrix6<f64>),
+        baseline: f64,
+        votes: usize,
+    ) -> Option<Self> {
+        let step = from_to.translation;
+        let along = step.try_normalize(0.0)?;
+        let variance = along.dot(&(covariance.fixed_view::<3, 3>(3, 3) * along));
+        let scale = scale_of_centers(baseline.recip());
+        Some(Self {
+            reference,
+            from,
+            to,
+            ratio: step.norm() / baseline,
+            deviation: variance.max(0.0).sqrt() / step.norm(),
+            votes,
+            pose: Rigid::new(from_to.rotation, step / baseline),
+            covariance: scale * covariance * scale,
+        })
+    }
+
+    /// The pose of `to` in the frame of `from` and its covariance where the reference baseline has this length.
+    pub(crate) fn at_baseline(&self, baseline: f64) -> (Rigid, Matrix6<f64>) {
+        let scale = scale_of_centers(baseline);
+        (Rigid::new(self.pose.rotation, self.pose.translation * baseline), scale * self.covariance * scale)
+    }
+
     /// The three images, and the ratio as bundle adjustment takes it.
     pub fn held(&self) -> ([ImageId; 3], LengthRatio) {
         let length = LengthRatio { ratio: self.ratio, deviation: self.deviation };
@@ -144,6 +174,13 @@ impl BaselineLength {
         let pose = Rigid::new(rotation, from.inverse() * self.pose.translation);
         Self { pose, covariance: jacobian * self.covariance * jacobian.transpose(), ..self }
     }
+}
+
+/// Leaves rotations and scales centres.
+fn scale_of_centers(factor: f64) -> Matrix6<f64> {
+    let mut scale = Matrix6::identity();
+    scale.fixed_view_mut::<3, 3>(3, 3).scale_mut(factor);
+    scale
 }
 
 /// One connected component of a scene or of a local model.

@@ -158,24 +158,14 @@ pub(super) fn continue_planes(
         let covariance = of_unknown_direction(&other_from_image.translation, deviation);
         (other_from_image, covariance, agreeing.len(), pair.matches)
     };
-    let step = other_from_image.translation;
-    let ratio = step.norm() / baseline;
-    let along = step.normalize();
-    let deviation = along.dot(&(covariance.fixed_view::<3, 3>(3, 3) * along)).max(0.0).sqrt() / step.norm();
-    let mut scale = Matrix6::<f64>::identity();
-    scale.fixed_view_mut::<3, 3>(3, 3).scale_mut(baseline.recip());
     Some(Continued {
         world_from_camera: pose.world_from_camera * other_from_image,
-        length: BaselineLength {
-            reference,
-            from: other,
-            to: image,
-            ratio,
-            deviation,
+        length: BaselineLength::of_step(
+            [reference, other, image],
+            (other_from_image, &covariance),
+            baseline,
             votes,
-            pose: Rigid::new(other_from_image.rotation, step / baseline),
-            covariance: scale * covariance * scale,
-        },
+        )?,
         matches,
     })
 }
