@@ -278,6 +278,7 @@ impl World {
             votes: 20,
             pose,
             covariance,
+            either: None,
         });
     }
 

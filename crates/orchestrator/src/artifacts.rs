@@ -111,7 +111,7 @@ pub struct LikelyImages(pub Vec<Vec<u32>>);
 
 serde_artifact!(LikelyImages, "likely images", 1);
 serde_artifact!(VerifiedPair, "verified pair", 1);
-serde_artifact!(MapperOutput, "model", 5);
+serde_artifact!(MapperOutput, "model", 6);
 serde_artifact!(SceneIndex, "index", 1);
 serde_artifact!(SingleLocalization, "photo localization", 2);
 serde_artifact!(Growth, "growth", 1);

@@ -16,8 +16,8 @@ use std::sync::Arc;
 
 use setloc_features::{ImagePyramid, PatchParams};
 
-use self::{floor::Floor, sight::View};
-use crate::{BaselineLength, ImageId, Reconstruction, Rigid};
+use self::{corner::Sharpened, floor::Floor, sight::View};
+use crate::{BaselineLength, ImageId, Reconstruction, Rigid, StepPose};
 
 /// How patches of the ground are aligned: at a grazing angle little of them is sharp.
 const PATCH: PatchParams =
@@ -87,10 +87,23 @@ impl<'a> Corner<'a> {
             .filter_map(|[first, second]| Some([self.views.get(first)?, self.views.get(second)?]))
             .collect();
         let floor = Floor::find(&pairs, from, self.baseline)?;
-        let (pose, covariance) = self.length.at_baseline(self.baseline);
-        let found = corner::find([from, to], (&pose, &covariance), &floor)?;
+        let sought = |pose: &StepPose| corner::find([from, to], &pose.scaled(self.baseline), &floor);
+        let found = match &self.length.either {
+            Some(poses) => one_of(poses, sought)?,
+            None => sought(&self.length.step())?,
+        };
         let BaselineLength { reference, from, to, votes, .. } = *self.length;
-        let pose = (found.first_from_second, &found.covariance);
-        BaselineLength::of_step([reference, from, to], pose, self.baseline, votes + found.patches)
+        BaselineLength::of_step([reference, from, to], &found.pose, self.baseline, votes + found.patches)
     }
+}
+
+/// The pose that the ground tells from the other; `None` where it tells neither, or both.
+fn one_of(poses: &[StepPose; 2], sought: impl Fn(&StepPose) -> Option<Sharpened>) -> Option<Sharpened> {
+    if !poses.iter().all(corner::is_known) {
+        return None;
+    }
+    let [first, second] = [0, 1].map(|at| sought(&poses[at]));
+    let likeness = |found: &Option<Sharpened>| found.as_ref().map_or(0.0, |found| found.likeness);
+    let (best, other) = if likeness(&second) > likeness(&first) { (second, first) } else { (first, second) };
+    best.filter(|best| best.decides_against(other.as_ref()))
 }

@@ -30,6 +30,6 @@ pub use mapper::{
 pub use quality::{PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess};
 pub use reconstruction::{
     AlignedTrack, BaselineLength, CameraId, ImageId, Observation, Place, PointId, Reconstruction,
-    ReconstructionImage, ReconstructionPoint,
+    ReconstructionImage, ReconstructionPoint, StepPose,
 };
 pub use two_view::{PairGeometry, TWO_VIEW_VERSION, TwoView, TwoViewKind, TwoViewParams, verify_pair};

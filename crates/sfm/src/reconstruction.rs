@@ -103,23 +103,62 @@ pub struct BaselineLength {
     pub votes: usize,
     /// Pose of `to` in the frame of `from`, in lengths of the reference baseline.
     pub pose: Rigid,
-    /// Its covariance: rotation about the axes of `to`, then the centre.
+    /// Covariance of the pose: rotation about the axes of `to` in radians, then the centre in the same unit.
+    pub covariance: Matrix6<f64>,
+    /// Where a wall leaves two poses open: either, in the same unit, with what is known of it alone. `covariance` is then of
+    /// which is right, too.
+    pub either: Option<[StepPose; 2]>,
+}
+
+/// The pose of the second camera of a step in the frame of the first.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct StepPose {
+    /// The pose.
+    pub first_from_second: Rigid,
+    /// Covariance: rotation about the second's axes in radians, then its centre in the unit of the pose.
     pub covariance: Matrix6<f64>,
 }
 
+impl StepPose {
+    /// The same where the unit is this many times smaller.
+    #[must_use]
+    pub(crate) fn scaled(&self, factor: f64) -> Self {
+        let Rigid { rotation, translation } = self.first_from_second;
+        let mut scale = Matrix6::<f64>::identity();
+        scale.fixed_view_mut::<3, 3>(3, 3).scale_mut(factor);
+        Self {
+            first_from_second: Rigid::new(rotation, translation * factor),
+            covariance: scale * self.covariance * scale,
+        }
+    }
+
+    /// The same in other frames of the two cameras, given their turns into the present ones.
+    #[must_use]
+    fn turned(&self, first: &UnitQuaternion<f64>, second: &UnitQuaternion<f64>) -> Self {
+        let Rigid { rotation, translation } = self.first_from_second;
+        let mut jacobian = Matrix6::zeros();
+        jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(second.inverse().to_rotation_matrix().matrix());
+        jacobian.fixed_view_mut::<3, 3>(3, 3).copy_from(first.inverse().to_rotation_matrix().matrix());
+        Self {
+            first_from_second: Rigid::new(first.inverse() * rotation * second, first.inverse() * translation),
+            covariance: jacobian * self.covariance * jacobian.transpose(),
+        }
+    }
+}
+
 impl BaselineLength {
-    /// The length of the step from `from` to `to`, with their pose in units of the model, its covariance (rotation about
-    /// the axes of `to`, then the centre) and the reference baseline's length; `None` without a step.
+    /// The length of the step from `from` to `to`, with their pose in units of the model and the reference baseline's
+    /// length; `None` without a step.
     pub(crate) fn of_step(
         [reference, from, to]: [ImageId; 3],
-        (from_to, covariance): (Rigid, &Matrix6<f64>),
+        pose: &StepPose,
         baseline: f64,
         votes: usize,
     ) -> Option<Self> {
-        let step = from_to.translation;
+        let step = pose.first_from_second.translation;
         let along = step.try_normalize(0.0)?;
-        let variance = along.dot(&(covariance.fixed_view::<3, 3>(3, 3) * along));
-        let scale = scale_of_centers(baseline.recip());
+        let variance = along.dot(&(pose.covariance.fixed_view::<3, 3>(3, 3) * along));
+        let StepPose { first_from_second, covariance } = pose.scaled(baseline.recip());
         Some(Self {
             reference,
             from,
@@ -127,15 +166,15 @@ impl BaselineLength {
             ratio: step.norm() / baseline,
             deviation: variance.max(0.0).sqrt() / step.norm(),
             votes,
-            pose: Rigid::new(from_to.rotation, step / baseline),
-            covariance: scale * covariance * scale,
+            pose: first_from_second,
+            covariance,
+            either: None,
         })
     }
 
-    /// The pose of `to` in the frame of `from` and its covariance where the reference baseline has this length.
-    pub(crate) fn at_baseline(&self, baseline: f64) -> (Rigid, Matrix6<f64>) {
-        let scale = scale_of_centers(baseline);
-        (Rigid::new(self.pose.rotation, self.pose.translation * baseline), scale * self.covariance * scale)
+    /// The pose of `to` in the frame of `from`, in lengths of the reference baseline.
+    pub(crate) fn step(&self) -> StepPose {
+        StepPose { first_from_second: self.pose, covariance: self.covariance }
     }
 
     /// The three images, and the ratio as bundle adjustment takes it.
@@ -167,20 +206,10 @@ impl BaselineLength {
     /// The same in other frames of the two cameras, given their turns into the present ones.
     #[must_use]
     pub fn turned(self, from: &UnitQuaternion<f64>, to: &UnitQuaternion<f64>) -> Self {
-        let rotation = from.inverse() * self.pose.rotation * to;
-        let mut jacobian = Matrix6::zeros();
-        jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(to.inverse().to_rotation_matrix().matrix());
-        jacobian.fixed_view_mut::<3, 3>(3, 3).copy_from(from.inverse().to_rotation_matrix().matrix());
-        let pose = Rigid::new(rotation, from.inverse() * self.pose.translation);
-        Self { pose, covariance: jacobian * self.covariance * jacobian.transpose(), ..self }
+        let StepPose { first_from_second, covariance } = self.step().turned(from, to);
+        let either = self.either.map(|poses| poses.map(|pose| pose.turned(from, to)));
+        Self { pose: first_from_second, covariance, either, ..self }
     }
-}
-
-/// Leaves rotations and scales centres.
-fn scale_of_centers(factor: f64) -> Matrix6<f64> {
-    let mut scale = Matrix6::identity();
-    scale.fixed_view_mut::<3, 3>(3, 3).scale_mut(factor);
-    scale
 }
 
 /// One connected component of a scene or of a local model.
@@ -304,6 +333,7 @@ mod tests {
                 votes: 20,
                 pose: Rigid::identity(),
                 covariance: Matrix6::identity(),
+                either: None,
             }],
         };
         let listed = model.by_name();

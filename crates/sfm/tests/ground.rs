@@ -7,7 +7,7 @@ use nalgebra::{Matrix6, UnitQuaternion, Vector2, Vector3};
 use setloc_features::{Camera, DecodedImage, ImagePyramid};
 use setloc_sfm::{
     BaselineLength, CameraId, ImageId, Observation, Reconstruction, ReconstructionImage, ReconstructionPoint,
-    Rigid, sharpen_lengths,
+    Rigid, StepPose, sharpen_lengths,
 };
 
 /// Height of the cameras over the ground, and steps along the street.
@@ -105,6 +105,7 @@ impl Street {
             votes: 10,
             pose: Rigid::new(known.rotation, known.translation / baseline),
             covariance,
+            either: None,
         };
         let image = |(at, pose): (usize, &Rigid)| ReconstructionImage {
             name: format!("{at}.jpg"),
@@ -118,6 +119,20 @@ impl Street {
             lengths: vec![length],
         };
         Self { truth, component, images }
+    }
+
+    /// Lets the last pose be this one of two, the other of which is 5° and 2 m off; the first of them is stated.
+    fn leave_open(&mut self, right: usize) {
+        let length = &mut self.component.lengths[0];
+        let known = StepPose { first_from_second: length.pose, covariance: length.covariance };
+        let Rigid { rotation, translation } = length.pose;
+        let turn = UnitQuaternion::from_euler_angles(0.0, 5_f64.to_radians(), 0.0);
+        let aside = UnitQuaternion::from_euler_angles(0.0, -0.5, 0.0);
+        let other = StepPose { first_from_second: Rigid::new(rotation * turn, aside * translation), ..known };
+        let mut poses = [other; 2];
+        poses[right] = known;
+        length.pose = poses[0].first_from_second;
+        length.either = Some(poses);
     }
 
     fn sharpen(&mut self) -> usize {
@@ -169,4 +184,26 @@ fn what_cannot_be_loaded_is_said_and_changes_nothing() {
     let failed = sharpen_lengths(&mut street.component, Err::<Arc<ImagePyramid>, _>);
     assert!(failed.is_err());
     assert_eq!(street.component, before);
+}
+
+#[test]
+fn paving_tells_which_of_two_poses_is_right() {
+    for right in 0..2 {
+        let mut street = Street::new([0, 0]);
+        street.leave_open(right);
+        let before = street.error();
+        assert_eq!(street.sharpen(), 1, "{right}");
+        let after = street.error();
+        assert!(after.0 < 0.002 && after.1 < 0.08 && after.2 < 3.0, "{right}: {before:?} {after:?}");
+        assert_eq!(street.component.lengths[0].either, None);
+    }
+}
+
+#[test]
+fn other_paving_tells_nothing_of_two_poses() {
+    let mut street = Street::new([0, 1]);
+    street.leave_open(1);
+    let before = street.component.lengths.clone();
+    assert_eq!(street.sharpen(), 0);
+    assert_eq!(street.component.lengths, before);
 }

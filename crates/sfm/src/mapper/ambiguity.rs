@@ -206,7 +206,17 @@ mod tests {
 
     fn length_of([reference, from, to]: [ImageId; 3]) -> BaselineLength {
         let (pose, covariance) = (Rigid::default(), Matrix6::identity());
-        BaselineLength { reference, from, to, ratio: 1.0, deviation: 0.1, votes: 10, pose, covariance }
+        BaselineLength {
+            reference,
+            from,
+            to,
+            ratio: 1.0,
+            deviation: 0.1,
+            votes: 10,
+            pose,
+            covariance,
+            either: None,
+        }
     }
 
     #[test]

@@ -25,7 +25,7 @@ use super::{
     plane::{Plane, SeenPoint, find_planes},
 };
 use crate::{
-    BaselineLength, ImageId, Observation, Rigid,
+    BaselineLength, ImageId, Observation, Rigid, StepPose,
     robust::{RansacParams, estimate_relative_pose, refine_relative_pose},
     solvers::{
         essential::essential_from_pose,
@@ -141,9 +141,9 @@ pub(super) fn continue_planes(
     let measured =
         PairByWall::find(model, image, other, (image_from_other, verified), &scene, baseline, seed)
             .filter(|found| is_step(found.measured.pair.second_from_first().translation.norm()));
-    let (other_from_image, covariance, votes, matches) = if let Some(found) = measured {
-        let PairByWall { measured, votes, matches } = found;
-        (measured.pair.second_from_first().inverse(), measured.covariance * of_few(votes), votes, matches)
+    let (step, either, votes, matches) = if let Some(found) = measured {
+        let (step, either) = found.step();
+        (step, either, found.votes, found.matches)
     } else {
         let pair = Pair::new(model, image, other, (image_from_other, verified), seed);
         let votes = votes(&scene, &pair.points(&pair.image_from_other), seed);
@@ -156,27 +156,18 @@ pub(super) fn continue_planes(
         let mut other_from_image = pair.image_from_other.inverse();
         other_from_image.translation *= length;
         let covariance = of_unknown_direction(&other_from_image.translation, deviation);
-        (other_from_image, covariance, agreeing.len(), pair.matches)
+        let step = StepPose { first_from_second: other_from_image, covariance };
+        (step, None, agreeing.len(), pair.matches)
     };
+    let length = BaselineLength::of_step([reference, other, image], &step, baseline, votes)?;
     Some(Continued {
-        world_from_camera: pose.world_from_camera * other_from_image,
-        length: BaselineLength::of_step(
-            [reference, other, image],
-            (other_from_image, &covariance),
-            baseline,
-            votes,
-        )?,
+        world_from_camera: pose.world_from_camera * step.first_from_second,
+        length: BaselineLength {
+            either: either.map(|poses| poses.map(|pose| pose.scaled(baseline.recip()))),
+            ..length
+        },
         matches,
     })
-}
-
-/// Factor on the covariance of a pose that hangs on so many points of known planes: the scatter of few understates itself.
-///
-/// On two rendered corners with 7 and 8 such points the errors were 1.0–1.5 times what was stated, and the target was called
-/// localized at 0.24 and 0.34 m; with 15 and more they are 0.7 times that.
-fn of_few(points: usize) -> f64 {
-    let freedom = points.saturating_sub(4).max(1);
-    points as f64 / freedom as f64
 }
 
 /// Standard deviations of the direction of a baseline and of the rotation where no homography tells them.

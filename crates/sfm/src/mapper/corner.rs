@@ -4,7 +4,7 @@
 //! image before sees on the continuation of a known plane is expected in one place. So the length is that at which
 //! keypoints that look alike are found where they are expected, on many rays; chance finds them at any length alike.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix6, Vector3};
 use setloc_features::{DESCRIPTOR_LEN, Match, squared_distance};
 
 use super::{
@@ -13,7 +13,7 @@ use super::{
     nearby::Nearby,
     wall::{Bearings, Measured, OnPlane, PLANES, WallPair},
 };
-use crate::{ImageId, Rigid};
+use crate::{ImageId, Rigid, StepPose};
 
 /// How far from its place a keypoint is sought: on a known plane, and on the wall.
 const SEARCH_RAD: f64 = 0.006;
@@ -30,6 +30,8 @@ const SAME_LENGTH: f64 = 0.3;
 const WALL_LEAD: f64 = 1.5;
 /// Fewest keypoints on known planes that must be found.
 const MIN_FOUND: usize = 5;
+/// Fewest that the pose of a rival must keep, to be known.
+const MIN_OF_RIVAL: usize = 3;
 /// Logarithm of the largest number of lengths at which chance finds as many, and the least that is expected of chance.
 const MAX_LN_FALSE_ALARMS: f64 = -7.0;
 const LEAST_BY_CHANCE: f64 = 0.2;
@@ -40,6 +42,15 @@ pub(super) struct PairByWall {
     /// Points of known planes that agree.
     pub votes: usize,
     pub matches: Vec<Match>,
+    /// The other pose that the wall leaves, where it may be right as well.
+    pub rival: Option<Rival>,
+}
+
+/// The other pose that a wall leaves.
+pub(super) struct Rival {
+    pub pair: WallPair,
+    /// What is known of it, where it can be adjusted.
+    pub covariance: Option<Matrix6<f64>>,
 }
 
 /// A keypoint of the first image and where it meets a known plane.
@@ -70,34 +81,52 @@ impl PairByWall {
             let peak = length_of(&votes(scene, &pair.points(&pair.image_from_other), seed), seed)?;
             Some((peak.log_likelihood, wall.scaled(peak.length.exp())))
         };
-        let scaled = walls
-            .iter()
-            .filter_map(by_votes)
-            .reduce(|a, b| if b.0 > a.0 { b } else { a })
-            .map(|(_, wall)| wall);
-        let by_places = |wall: &WallPair| {
-            let (found, length) = seeker.length_by_places(wall, &seeker.reached(scene, wall), baseline)?;
-            Some((found, wall.scaled(length)))
+        let voted = walls.iter().filter_map(by_votes).reduce(|a, b| if b.0 > a.0 { b } else { a });
+        let open = match voted {
+            Some((_, wall)) => vec![wall],
+            None => seeker.open_by_places(&walls, scene, baseline),
         };
-        let mut by_places: Vec<(usize, WallPair)> =
-            if scaled.is_none() { walls.iter().filter_map(by_places).collect() } else { Vec::new() };
-        by_places.sort_by_key(|(found, _)| std::cmp::Reverse(*found));
-        let mut by_places = by_places.into_iter();
-        let best = by_places.next();
-        let rival = by_places.next().filter(|(found, _)| {
-            best.as_ref().is_some_and(|(most, _)| (*most as f64) < WALL_LEAD * *found as f64)
+        let measured = |wall: &WallPair| {
+            let reached = seeker.reached(scene, wall);
+            let first = seeker.measure(wall, &reached, verified)?;
+            // What is found at the first pose places the others better.
+            seeker.measure(&first.measured.pair, &reached, verified)
+        };
+        let mut open: Vec<(WallPair, Option<Self>)> =
+            open.iter().map(|wall| (*wall, measured(wall))).collect();
+        let stands =
+            |(_, found): &(_, Option<Self>)| found.as_ref().is_some_and(|found| found.votes >= MIN_FOUND);
+        let (_, found) = open.remove(open.iter().position(stands)?);
+        let rival = open.pop().map(|(wall, found)| match found.filter(|found| found.votes >= MIN_OF_RIVAL) {
+            Some(Self { measured, votes, .. }) => {
+                Rival { pair: measured.pair, covariance: Some(measured.covariance * of_few(votes)) }
+            }
+            None => Rival { pair: wall, covariance: None },
         });
-        let scaled = scaled.or(best.map(|(_, wall)| wall))?;
-        // What is found at the first pose places the others better.
-        let reached = seeker.reached(scene, &scaled);
-        let first = seeker.measure(&scaled, &reached, verified)?;
-        let mut found = seeker.measure(&first.measured.pair, &reached, verified)?;
-        if let Some((_, rival)) = rival {
-            let apart = found.measured.pair.shift_to(&rival);
-            found.measured.covariance += apart * apart.transpose();
-        }
-        Some(found)
+        found.map(|found| Self { rival, ..found })
     }
+
+    /// The pose of the second image and what is known of it; where the wall leaves another, of each, too.
+    pub fn step(&self) -> (StepPose, Option<[StepPose; 2]>) {
+        let pose = |pair: &WallPair, covariance| StepPose {
+            first_from_second: pair.second_from_first().inverse(),
+            covariance,
+        };
+        let own = pose(&self.measured.pair, self.measured.covariance * of_few(self.votes));
+        let Some(rival) = &self.rival else { return (own, None) };
+        let apart = self.measured.pair.shift_to(&rival.pair);
+        let both = StepPose { covariance: own.covariance + apart * apart.transpose(), ..own };
+        (both, rival.covariance.map(|covariance| [own, pose(&rival.pair, covariance)]))
+    }
+}
+
+/// Factor on the covariance of a pose that hangs on so many points of known planes: the scatter of few understates itself.
+///
+/// On two rendered corners with 7 and 8 such points the errors were 1.0–1.5 times what was stated, and the target was called
+/// localized at 0.24 and 0.34 m; with 15 and more they are 0.7 times that.
+fn of_few(points: usize) -> f64 {
+    let freedom = points.saturating_sub(4).max(1);
+    points as f64 / freedom as f64
 }
 
 /// Logarithm of how many of so many lengths find this count or more when chance finds `mean`: bounded by the first
@@ -203,6 +232,21 @@ impl<'m, 'a> Seeker<'m, 'a> {
         self.matches(&expected, SEARCH_RAD)
     }
 
+    /// The poses of walls at the lengths at which most is found where it is expected: the best, and the next where it may
+    /// be right as well.
+    fn open_by_places(&self, walls: &[WallPair], scene: &Surroundings<'_>, baseline: f64) -> Vec<WallPair> {
+        let by_places = |wall: &WallPair| {
+            let (found, length) = self.length_by_places(wall, &self.reached(scene, wall), baseline)?;
+            Some((found, wall.scaled(length)))
+        };
+        let mut placed: Vec<(usize, WallPair)> = walls.iter().filter_map(by_places).collect();
+        placed.sort_by_key(|(found, _)| std::cmp::Reverse(*found));
+        let most = placed.first().map_or(0, |(found, _)| *found);
+        placed.retain(|(found, _)| (most as f64) < WALL_LEAD * *found as f64);
+        placed.truncate(2);
+        placed.into_iter().map(|(_, wall)| wall).collect()
+    }
+
     /// The length at which most is found where it is expected, and how much; `None` unless it stands out.
     fn length_by_places(&self, wall: &WallPair, reached: &[Reached], baseline: f64) -> Option<(usize, f64)> {
         let range = MAX_STEP_RATIO.ln();
@@ -269,7 +313,7 @@ impl<'m, 'a> Seeker<'m, 'a> {
         let measured = wall.measure(&bearings(&first, &second), on_wall, &on_planes, deviations)?;
         let votes = measured.on_planes;
         let kept = measured.matches.iter().map(|&at| matches[at]).collect();
-        (votes >= MIN_FOUND).then_some(PairByWall { measured, votes, matches: kept })
+        Some(PairByWall { measured, votes, matches: kept, rival: None })
     }
 }
 
