@@ -84,7 +84,8 @@ pub struct Growth {
     pub points: Vec<GrowthPoint>,
 }
 
-/// What localized photos add to a scene: an answer for each photo; those without, or not *localized*, are left out.
+/// What localized photos add to a component of a scene: an answer for each photo; those without, not *localized*, or in
+/// another component are left out.
 ///
 /// `alone` is what [`locate_single`](crate::locate_single) says of each photo, and `local_models` are as
 /// [`locate_set`](crate::locate_set) takes them.
@@ -98,7 +99,9 @@ pub fn grow(
 ) -> Growth {
     let placed: Vec<Placed<'_>> = (0..photos.len().min(alone.len()))
         .zip(answers)
-        .filter_map(|(photo, answer)| Placed::new(photo, &photos[photo], (*answer)?))
+        .filter_map(|(photo, answer)| Some((photo, (*answer)?)))
+        .filter(|(_, answer)| answer.component == scene.component)
+        .filter_map(|(photo, answer)| Placed::new(photo, &photos[photo], answer))
         .collect();
     let grower = Grower { params, max_error_sigmas: camset.max_error_sigmas, scene, alone, placed: &placed };
     let guided = |photo: &Placed<'_>| {
@@ -328,7 +331,8 @@ mod tests {
     }
 
     fn scene_of(grown: &GrownScene) -> Scene<'_> {
-        Scene { reconstruction: &grown.reconstruction, index: &grown.index, grown: &grown.grown }
+        let (reconstruction, index) = (&grown.reconstruction, &grown.index);
+        Scene { component: 0, is_placed: false, reconstruction, index, grown: &grown.grown }
     }
 
     #[test]

@@ -9,9 +9,13 @@
 //! found; whether it may be used is decided afterwards from evidence that the estimation did not create (matches
 //! before guided matching, the runner-up hypothesis, the covariance, the chain of links).
 //!
+//! A scene may have several components, each in a frame of its own. Photos are sought in one ([`locate_single`],
+//! [`locate_set`]) or in all of them ([`locate_single_anywhere`], [`locate_set_anywhere`]).
+//!
 //! It knows no files and no features beyond those handed in, and it builds no local models.
 
 mod advice;
+mod anywhere;
 mod common;
 mod evidence;
 mod grow;
@@ -28,13 +32,14 @@ mod verdict;
 mod views;
 
 pub use advice::{Link, PathToScene};
+pub use anywhere::locate_single_anywhere;
 pub use grow::{GrownScene, Growth, GrowthParams, GrowthPhoto, GrowthPoint, grow};
 pub use params::{CamsetMethod, CamsetParams, GuidedParams, SingleParams, VerdictParams};
-pub use set::locate_set;
+pub use set::{locate_set, locate_set_anywhere};
 pub use single::locate_single;
 pub use types::{
-    GrownImage, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SetLocalization, SingleLocalization,
-    Verdict,
+    AnywhereLocalization, GrownImage, PhotoLocalization, PlacedModel, QueryPhoto, Scene, SceneMatch,
+    SetLocalization, SingleLocalization, Verdict,
 };
 pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match_views};
 
@@ -48,7 +53,8 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// what any of them sees. 14: photos stand where their pair by planes has them, as well as that tells.
 /// 15: only matches hundreds of deviations off are no noise. 16: what points do not localize is matched with the scene's
 /// images. 17, 18: by fewer matches a pair, all photos alike. 19: contradictions are named, advice goes with the answers.
-pub const VERSION: u32 = 19;
+/// 20: all components of a scene are searched.
+pub const VERSION: u32 = 20;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

@@ -2,6 +2,7 @@
 
 mod correspondences;
 mod joint;
+mod merged;
 mod rigid;
 mod scale;
 mod sights;
@@ -12,13 +13,15 @@ use setloc_sfm::{CameraId, ImageId, Reconstruction, ReconstructionImage, Rigid};
 
 use crate::advice::{Link, widest_paths};
 use crate::{
-    CamsetParams, PhotoLocalization, QueryPhoto, Scene, SetLocalization, SingleLocalization, Verdict, Views,
-    verdict::standard_deviations,
+    CamsetParams, PhotoLocalization, PlacedModel, QueryPhoto, Scene, SetLocalization, SingleLocalization,
+    Verdict, Views, verdict::standard_deviations,
 };
 
 use joint::{Component, ComponentAnswer};
 
-/// Localizes a set through its local models (components of the photos' own reconstruction, largest first).
+pub use merged::locate_set_anywhere;
+
+/// Localizes a set in one component of the scene, through its local models (components of the photos' own reconstruction, largest first).
 ///
 /// Image ids of `local_models` are indices into `photos`; models with fewer than two registered photos are left out.
 /// `alone` is what [`locate_single`](crate::locate_single) says of each photo; photos beyond its end are left out.
@@ -39,18 +42,30 @@ pub fn locate_set<E>(
     views: impl FnOnce() -> Result<Views, E>,
     seed: u64,
 ) -> Result<SetLocalization, E> {
+    Ok(answer(params, scene, photos, alone, local_models, views, seed)?.finished())
+}
+
+fn answer<E>(
+    params: &CamsetParams,
+    scene: &Scene<'_>,
+    photos: &[QueryPhoto<'_>],
+    alone: &[&SingleLocalization],
+    local_models: &[Reconstruction],
+    views: impl FnOnce() -> Result<Views, E>,
+    seed: u64,
+) -> Result<Answer, E> {
     let photos = &photos[..photos.len().min(alone.len())];
     let evidence = &alone[..photos.len()];
     let by_points = locate_by(params, scene, (photos, evidence), local_models, &Views::default(), seed);
     if by_points.set.refined.iter().all(|photo| photo.verdict == Verdict::Localized) {
-        return Ok(by_points.finished());
+        return Ok(by_points);
     }
     let views = views()?;
     if views.matches.is_empty() {
-        return Ok(by_points.finished());
+        return Ok(by_points);
     }
     let by_views = locate_by(params, scene, (photos, evidence), local_models, &views, seed);
-    Ok(better_of(by_points, by_views).finished())
+    Ok(better_of(by_points, by_views))
 }
 
 /// What was found of a set, not yet in words.
@@ -61,6 +76,8 @@ struct Answer {
     remarks: Vec<Remark>,
     /// Whether each photo, localized alone, stands elsewhere.
     elsewhere: Vec<bool>,
+    /// What holds each photo: the scene points that it and the photos placed with it see, by photo.
+    seen: Vec<Vec<(usize, usize)>>,
 }
 
 /// What is to be said of a local model.
@@ -75,7 +92,7 @@ struct Remark {
 impl Answer {
     /// With contradictions and advice: what happened to each model, then what to do about each photo that is not localized.
     fn finished(self) -> SetLocalization {
-        let Self { mut set, remarks, elsewhere } = self;
+        let Self { mut set, remarks, elsewhere, .. } = self;
         let is_localized = |photo: &usize| set.refined[*photo].verdict == Verdict::Localized;
         let holds = |remark: &Remark| !(remark.is_refusal && remark.members.iter().all(is_localized));
         set.advice = remarks.into_iter().filter(holds).map(|remark| remark.text).collect();
@@ -108,12 +125,13 @@ fn better_of(first: Answer, second: Answer) -> Answer {
         return first;
     }
     let mut best = second;
-    let Answer { set: first, elsewhere, .. } = first;
+    let Answer { set: first, elsewhere, seen, .. } = first;
     for (at, refined) in first.refined.into_iter().enumerate() {
         if refined.verdict.rank() > best.set.refined[at].verdict.rank() {
             best.set.refined[at] = refined;
             best.set.paths[at] = first.paths[at].clone();
             best.elsewhere[at] = elsewhere[at];
+            best.seen[at].clone_from(&seen[at]);
         }
     }
     for (kept, rigid) in best.set.rigid.iter_mut().zip(first.rigid) {
@@ -137,6 +155,7 @@ fn locate_by(
 ) -> Answer {
     let (mut answer, mut remarks) = (SetLocalization::default(), Vec::new());
     let mut elsewhere = vec![false; photos.len()];
+    let mut seen: Vec<_> = evidence.iter().enumerate().map(|(at, e)| vec![(at, e.photo.inliers)]).collect();
     let mut rigid: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut refined: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut scene_links: Vec<usize> =
@@ -157,12 +176,15 @@ fn locate_by(
         let component = Component { params, scene, photos, evidence, model, members: &members, views };
         match component.locate(seed) {
             ComponentAnswer::Localized(found) => {
-                answer.world_from_set.push(found.world_from_set);
+                let (component, world_from_set) = (scene.component, found.world_from_set);
+                answer.placed.push(PlacedModel { component, world_from_set });
+                let seen_by_all: Vec<_> = members.iter().copied().zip(found.scene_points.clone()).collect();
                 for (slot, &photo) in members.iter().enumerate() {
                     scene_links[photo] = scene_links[photo].max(found.scene_points[slot]);
                     keep_better(&mut rigid[photo], found.rigid[slot].clone());
                     if keep_better(&mut refined[photo], found.refined[slot].clone()) {
                         elsewhere[photo] = found.elsewhere[slot];
+                        seen[photo].clone_from(&seen_by_all);
                     }
                 }
                 let remark = |text| Remark { members: members.clone(), is_refusal: false, text };
@@ -173,7 +195,8 @@ fn locate_by(
                     scene_links[photo] = scene_links[photo].max(scene_points[slot]);
                 }
                 let names: Vec<&str> = members.iter().map(|&photo| photos[photo].name).collect();
-                let text = format!("{} is not localized: {}", called(&names), reasons.join("; "));
+                let text =
+                    format!("{} is not localized: {}", called(&names, scene.component), reasons.join("; "));
                 remarks.push(Remark { members, is_refusal: true, text });
             }
         }
@@ -191,14 +214,18 @@ fn locate_by(
             photo.reasons.push(format!("its weakest link to the scene shares {} points only", link.shared));
         }
     }
-    Answer { set: answer, remarks, elsewhere }
+    Answer { set: answer, remarks, elsewhere, seen }
 }
 
-/// What photos that are placed together are called.
-fn called(names: &[&str]) -> String {
-    match names {
+/// What photos that are placed together are called, and in which component where it is not the largest.
+fn called(names: &[&str], component: usize) -> String {
+    let together = match names {
         [name] => format!("{name} by itself"),
         names => format!("the local model of {}", names.join(", ")),
+    };
+    match component {
+        0 => together,
+        _ => format!("{together}, in component {},", component + 1),
     }
 }
 
@@ -377,8 +404,8 @@ mod tests {
         // It goes by scene points, of which this set sees none.
         let params = CamsetParams { other_hypotheses: false, ..CamsetParams::default() };
         let (_, found) = locate_by_views_with(&params, &[5, 7], 1);
-        assert!(found.world_from_set.is_empty());
-        assert!(!locate_by_views(&[5, 7], 1).1.world_from_set.is_empty());
+        assert!(found.placed.is_empty());
+        assert!(!locate_by_views(&[5, 7], 1).1.placed.is_empty());
     }
 
     #[test]
@@ -470,6 +497,7 @@ mod tests {
         let photo = |verdict, x: f64| PhotoLocalization {
             name: String::new(),
             camera: crate::synthetic::pinhole(),
+            component: 0,
             world_from_camera: Some(Rigid::new(UnitQuaternion::identity(), Vector3::new(x, 0.0, 0.0))),
             covariance: Some(nalgebra::Matrix6::identity() * 1e-4),
             inliers: 20,
@@ -482,6 +510,7 @@ mod tests {
         };
         let answer = |photos: Vec<PhotoLocalization>| Answer {
             elsewhere: vec![false; photos.len()],
+            seen: vec![Vec::new(); photos.len()],
             remarks: vec![Remark { members: vec![0, 1], is_refusal: true, text: "refused".to_owned() }],
             set: SetLocalization {
                 rigid: photos.clone(),
@@ -672,7 +701,7 @@ mod tests {
     fn a_set_without_local_model_is_localized_photo_by_photo() {
         let world = World::chain(3, 0.2, 8);
         let found = locate_photos(&CamsetParams::default(), &world.scene(), &world.queries(), &[], 1);
-        assert!(found.world_from_set.is_empty());
+        assert!(found.placed.is_empty());
         assert!(
             found.refined.iter().all(|photo| photo.verdict == Verdict::Localized),
             "{:#?}",

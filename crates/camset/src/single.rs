@@ -29,7 +29,7 @@ struct SinglePose {
     evidence: Evidence,
 }
 
-/// Localizes one photo alone.
+/// Localizes one photo alone, in one component.
 ///
 /// 2D-to-3D matches pass a ratio test, LO-RANSAC with P3P finds the pose, scene points are then searched for near
 /// their projections and the pose (with the intrinsics, when they are not known) is refined on all inliers.
@@ -67,16 +67,16 @@ fn locate_with_nearest(
             matches.len(),
             params.verdict.min_inliers
         );
-        return (PhotoLocalization::not_localized(photo, reason), Vec::new());
+        return (PhotoLocalization::not_localized(photo, scene.component, reason), Vec::new());
     }
     let Some(found) = solve(params, scene, photo, nearest, &matches, seed) else {
         let reason = format!("no pose explains any of its {} matches to the scene", matches.len());
-        return (PhotoLocalization::not_localized(photo, reason), Vec::new());
+        return (PhotoLocalization::not_localized(photo, scene.component, reason), Vec::new());
     };
     let mut reasons = Vec::new();
     let mut verdict = judge_support(&params.verdict, &found.evidence, &mut reasons);
     if verdict == Verdict::NotLocalized {
-        let mut refused = PhotoLocalization::not_localized(photo, String::new());
+        let mut refused = PhotoLocalization::not_localized(photo, scene.component, String::new());
         (refused.reasons, refused.inliers) = (reasons, found.evidence.inliers);
         return (refused, Vec::new());
     }
@@ -87,6 +87,7 @@ fn locate_with_nearest(
     let answer = PhotoLocalization {
         name: photo.name.to_owned(),
         camera: found.camera,
+        component: scene.component,
         world_from_camera: Some(found.world_from_camera),
         covariance: found.covariance,
         inliers: found.inliers.len(),

@@ -374,7 +374,8 @@ impl World {
 
     /// The panoramas' model and its index.
     pub fn scene(&self) -> Scene<'_> {
-        Scene { reconstruction: &self.scene_model, index: &self.index, grown: &[] }
+        let (reconstruction, index) = (&self.scene_model, &self.index);
+        Scene { component: 0, is_placed: false, reconstruction, index, grown: &[] }
     }
 
     /// The photos, intrinsics known.

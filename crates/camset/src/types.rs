@@ -6,10 +6,14 @@ use setloc_sfm::{ImageId, PointId, Reconstruction, Rigid, Similarity};
 
 use crate::PathToScene;
 
-/// A built scene, borrowed.
+/// One component of a built scene, borrowed.
 #[derive(Debug, Clone, Copy)]
 pub struct Scene<'a> {
-    /// The scene's model (its largest component).
+    /// Which component of the scene it is; 0 is the largest.
+    pub component: usize,
+    /// Whether measured positions place it, so that its frame is that of all other components of which this is true.
+    pub is_placed: bool,
+    /// The component's model.
     pub reconstruction: &'a Reconstruction,
     /// Its searchable descriptors.
     pub index: &'a SceneIndex,
@@ -80,7 +84,9 @@ pub struct PhotoLocalization {
     pub name: String,
     /// The camera, with intrinsics refined when they were not known.
     pub camera: Camera,
-    /// Pose in the scene's frame, `None` when not localized.
+    /// Component of the scene in whose frame the pose is; 0 is the largest.
+    pub component: usize,
+    /// Pose in the component's frame, `None` when not localized.
     pub world_from_camera: Option<Rigid>,
     /// Covariance of the pose: rotation (rad, in the camera frame), then centre (scene units, in the scene frame).
     pub covariance: Option<Matrix6<f64>>,
@@ -93,11 +99,12 @@ pub struct PhotoLocalization {
 }
 
 impl PhotoLocalization {
-    /// The answer "not localized", for one reason.
-    pub fn not_localized(photo: &QueryPhoto<'_>, reason: impl Into<String>) -> Self {
+    /// The answer "not localized" in a component, for one reason.
+    pub fn not_localized(photo: &QueryPhoto<'_>, component: usize, reason: impl Into<String>) -> Self {
         Self {
             name: photo.name.to_owned(),
             camera: photo.camera.clone(),
+            component,
             world_from_camera: None,
             covariance: None,
             inliers: 0,
@@ -116,7 +123,7 @@ pub struct SceneMatch {
     pub point: PointId,
 }
 
-/// Where one photo is by itself, and what says so.
+/// Where one photo is by itself in one component, and what says so.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SingleLocalization {
     /// The answer.
@@ -127,6 +134,24 @@ pub struct SingleLocalization {
     pub nearest: Vec<NearestPoints>,
 }
 
+/// Where one photo is by itself, in whichever component of the scene.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct AnywhereLocalization {
+    /// The answer: that of the component which says most.
+    pub photo: PhotoLocalization,
+    /// What each component says, the largest first.
+    pub components: Vec<SingleLocalization>,
+}
+
+/// How a local model lies in the scene.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PlacedModel {
+    /// Component of the scene; 0 is the largest.
+    pub component: usize,
+    /// The component's frame from the local model's.
+    pub world_from_set: Similarity,
+}
+
 /// Where the photos of a set are.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SetLocalization {
@@ -134,8 +159,8 @@ pub struct SetLocalization {
     pub rigid: Vec<PhotoLocalization>,
     /// Poses after the joint refinement, one entry a photo ("camset+opt").
     pub refined: Vec<PhotoLocalization>,
-    /// Scene from local model, one per used component.
-    pub world_from_set: Vec<Similarity>,
+    /// The local models that are placed, by the scene's components.
+    pub placed: Vec<PlacedModel>,
     /// Names of photos that are localized alone, but at another place than with the set: either is wrong.
     pub contradicted: Vec<String>,
     /// The strongest way from the scene to each photo, one entry a photo.

@@ -24,5 +24,6 @@ pub use scene_index::{IndexGrowth, Row, SceneIndex};
 
 /// Version of the index's contents; bumped whenever equal inputs give another index.
 ///
-/// 1: exact, inverted lists, kd-tree over eight principal components. 2: covariances of aligned points.
-pub const VERSION: u32 = 2;
+/// 1: exact, inverted lists, kd-tree over eight principal components. 2: covariances of aligned points. 3: one index for
+/// each component of a scene.
+pub const VERSION: u32 = 3;

@@ -1,7 +1,7 @@
 //! What the jobs hand on, as files.
 
 use serde::{Deserialize, Serialize};
-use setloc_camset::{Growth, SetLocalization, SingleLocalization};
+use setloc_camset::{AnywhereLocalization, Growth, SetLocalization};
 use setloc_features::{ImageFeatures, Keypoint, Match, SimulatedView};
 use setloc_index::SceneIndex;
 use setloc_sfm::{MapperOutput, TwoView};
@@ -109,10 +109,14 @@ pub struct VerifiedPair(pub Vec<TwoView>);
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct LikelyImages(pub Vec<Vec<u32>>);
 
+/// The index of each component, the largest first.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct SceneIndices(pub Vec<SceneIndex>);
+
 serde_artifact!(LikelyImages, "likely images", 1);
 serde_artifact!(VerifiedPair, "verified pair", 1);
-serde_artifact!(MapperOutput, "model", 6);
-serde_artifact!(SceneIndex, "index", 1);
-serde_artifact!(SingleLocalization, "photo localization", 2);
+serde_artifact!(MapperOutput, "model", 7);
+serde_artifact!(SceneIndices, "index", 2);
+serde_artifact!(AnywhereLocalization, "photo localization", 3);
 serde_artifact!(Growth, "growth", 1);
-serde_artifact!(SetLocalization, "set localization", 2);
+serde_artifact!(SetLocalization, "set localization", 3);

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use anyhow::Result;
-use setloc_camset::{PhotoLocalization, SetLocalization, SingleLocalization, Verdict};
+use setloc_camset::{AnywhereLocalization, PhotoLocalization, SetLocalization, Verdict};
 use setloc_sfm::MapperOutput;
 
 use crate::building::alike_pairs;
@@ -122,7 +122,7 @@ fn run(
         }
         for job in single.iter().filter(|_| alone) {
             if executor.output(*job).is_some() {
-                located.single.push(executor.load::<SingleLocalization>(*job)?.photo.clone());
+                located.single.push(executor.load::<AnywhereLocalization>(*job)?.photo.clone());
             }
         }
         if let Some(set) = set.filter(|set| executor.output(set.set).is_some()) {
@@ -178,7 +178,8 @@ pub struct Grown {
     pub hash: ContentHash,
 }
 
-/// Adds those photos to the scene that are localized and not in it yet; `None` when there are none.
+/// Adds those photos to the scene that are localized in its largest component and not in it yet; `None` when there are
+/// none.
 ///
 /// The photos are those just located, under another name of a run.
 ///
@@ -195,7 +196,9 @@ pub fn grow(
         let photo = folder.images.iter().find(|photo| photo.name == name);
         photo.is_some_and(|photo| !what.scene.grown_from.contains(&photo.hash))
     };
-    let adds = |photo: &PhotoLocalization| photo.verdict == Verdict::Localized && is_new(&photo.name);
+    let adds = |photo: &PhotoLocalization| {
+        photo.verdict == Verdict::Localized && photo.component == 0 && is_new(&photo.name)
+    };
     if !located.answers().iter().any(|(_, photo)| adds(photo)) {
         return Ok(None);
     }
@@ -226,6 +229,7 @@ mod tests {
         let photo = |name: &str, verdict| PhotoLocalization {
             name: name.to_owned(),
             camera: Camera::equirectangular(20, 10),
+            component: 0,
             world_from_camera: None,
             covariance: None,
             inliers: 0,

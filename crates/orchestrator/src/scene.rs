@@ -18,12 +18,14 @@ use crate::serde_artifact;
 /// A built scene.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SceneFile {
-    /// Components, largest first; the index is of the first.
+    /// Components, largest first; all list the same images.
     pub components: Vec<Reconstruction>,
-    /// Searchable descriptors of the first component.
-    pub index: SceneIndex,
-    /// Features of the first component's images, by image id, as artifacts; empty where an image is not registered.
-    /// Photos that share too little with the points are matched with them ([`SceneFile::features_of`]).
+    /// Searchable descriptors of each component.
+    pub indices: Vec<SceneIndex>,
+    /// Whether measured positions place each component in the frame of `origin`; if not, its frame is its own.
+    pub placed: Vec<bool>,
+    /// Features of the images, by image id, as artifacts; empty where no component has registered an image. Photos that
+    /// share too little with the points are matched with them ([`SceneFile::features_of`]).
     pub features: Vec<Block>,
     /// WGS84 place of the world's origin, when positions were given.
     pub origin: Option<Wgs84>,
@@ -41,14 +43,14 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 9);
+serde_artifact!(SceneFile, "scene", 10);
 
 /// Bytes that are stored as one block.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Block(#[serde(with = "setloc_index::bytes")] pub Vec<u8>);
 
 impl SceneFile {
-    /// The features of an image of the first component; `None` where it is not registered.
+    /// The features of an image; `None` where no component has registered it.
     ///
     /// # Errors
     /// When the file is damaged.
@@ -78,6 +80,16 @@ impl SceneFile {
         self.grown.iter().filter_map(|grown| Some(images.get(grown.image.index())?.name.as_str())).collect()
     }
 
+    /// Whether measured positions place a component in the frame of `origin`.
+    pub fn is_placed(&self, component: usize) -> bool {
+        self.placed.get(component) == Some(&true)
+    }
+
+    /// Whether a component's frame is that of the largest.
+    pub fn shares_frame(&self, component: usize) -> bool {
+        component == 0 || (self.is_placed(0) && self.is_placed(component))
+    }
+
     /// Names of the images that no component has a pose of.
     pub fn unregistered(&self) -> Vec<&str> {
         let images = self.main().map_or(&[][..], |main| &main.images);
@@ -98,6 +110,21 @@ impl SceneFile {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn components_keep_their_indices_and_frames() {
+        let scene = SceneFile {
+            components: vec![Reconstruction::default(); 3],
+            indices: vec![SceneIndex::default(); 3],
+            placed: vec![true, false, true],
+            ..SceneFile::default()
+        };
+        let read: SceneFile = codec::decode(&codec::encode(&scene).unwrap()).unwrap();
+        assert_eq!(read, scene);
+        assert_eq!([0, 1, 2, 3].map(|component| read.shares_frame(component)), [true, false, true, false]);
+        let own = SceneFile { placed: vec![false, false, true], ..scene };
+        assert_eq!([0, 1, 2].map(|component| own.shares_frame(component)), [true, false, false]);
+    }
 
     #[test]
     fn features_are_read_image_by_image_and_damage_is_said() {

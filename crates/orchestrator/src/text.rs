@@ -6,3 +6,8 @@ use std::fmt::{Arguments, Write};
 pub fn add(text: &mut String, piece: Arguments<'_>) {
     let _ = text.write_fmt(piece);
 }
+
+/// Where a pose is that is not in the frame of the largest component; components count from 1.
+pub fn apart(component: usize) -> String {
+    format!("in component {}, apart from the largest: its frame is its own", component + 1)
+}

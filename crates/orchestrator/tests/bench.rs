@@ -108,7 +108,8 @@ fn a_data_set_by_path_keeps_its_results_schema() {
     let set = &results["sets"][0];
     assert_eq!(keys(set), ["advice", "images", "local_models", "methods", "name", "target"]);
     assert_eq!(keys(&set["methods"]), ["camset", "camset+opt", "single"]);
-    let method = ["calibration", "position_m", "registered", "rotation_deg", "target", "target_registered"];
+    let method =
+        ["apart", "calibration", "position_m", "registered", "rotation_deg", "target", "target_registered"];
     assert_eq!(keys(&set["methods"]["single"]), method);
     let refined = &set["methods"]["camset+opt"];
     assert_eq!(keys(&refined["calibration"]), ["mean", "photos", "within_95"]);

@@ -60,7 +60,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 23;
+pub const MAPPER_VERSION: u32 = 24;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -257,8 +257,8 @@ pub struct MapperReport {
     pub registrations: Vec<RegistrationRecord>,
     /// Attempts to join components in the order tried.
     pub merges: Vec<MergeRecord>,
-    /// How the largest component lies in the measured frame, when positions were given and fix it.
-    pub georegistration: Option<Georegistration>,
+    /// How each component lies in the measured frame, when positions were given and fix it.
+    pub georegistrations: Vec<Option<Georegistration>>,
     /// Things that disagree, in words.
     pub warnings: Vec<String>,
 }

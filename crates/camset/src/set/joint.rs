@@ -269,7 +269,7 @@ impl Component<'_> {
             rigid_support = Verdict::Uncertain;
         }
         let names: Vec<&str> = self.members.iter().map(|&photo| self.photos[photo].name).collect();
-        let mut remarks = vec![format!("{}: {}", called(&names), reasons.join("; "))];
+        let mut remarks = vec![format!("{}: {}", called(&names, self.scene.component), reasons.join("; "))];
         remarks.extend(self.lengths().map(|(slots, length)| self.basis(slots, &length)));
         let mut rigid_answers =
             self.rigid_answers(&set_from_camera, &candidates, &rigid, rigid_support, &reasons);
@@ -811,6 +811,7 @@ impl Component<'_> {
             .map(|slot| PhotoLocalization {
                 name: self.photos[self.members[slot]].name.to_owned(),
                 camera: self.model.cameras[self.camera_of(slot)].clone(),
+                component: self.scene.component,
                 world_from_camera: Some(rigid.world_from_set.transform_pose(&set_from_camera[slot])),
                 covariance: None,
                 inliers: seen[slot],
@@ -876,6 +877,7 @@ impl Component<'_> {
                 let answer = PhotoLocalization {
                     name: self.photos[photo].name.to_owned(),
                     camera: joint.model.cameras[self.camera_of(slot)].clone(),
+                    component: self.scene.component,
                     world_from_camera: Some(pose),
                     covariance,
                     inliers: joint.direct[slot].len() + joint.viewed[slot],

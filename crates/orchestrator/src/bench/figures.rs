@@ -81,6 +81,21 @@ impl Alignment {
         Some(Self { truth_from_scene, by_poses })
     }
 
+    /// Of a component of few images: over the centres where they spread in two directions, else over centres and
+    /// rotations alike, for which two images are enough.
+    pub fn of_component(
+        estimated: &BTreeMap<String, Rigid>,
+        truth: &BTreeMap<String, Rigid>,
+    ) -> Option<Self> {
+        let centers = estimated.iter().filter(|(name, _)| truth.contains_key(*name));
+        let centers: Vec<_> = centers.map(|(_, pose)| pose.translation).collect();
+        if spread_sideways(&centers) >= MIN_SIDEWAYS {
+            return Self::of_centres(estimated, truth);
+        }
+        let by_poses = by_poses(estimated, truth)?;
+        Some(Self { truth_from_scene: by_poses, by_poses })
+    }
+
     /// The error of a pose.
     pub fn error(&self, estimated: &Rigid, truth: &Rigid) -> PoseError {
         let aligned = self.truth_from_scene.transform_pose(estimated);
@@ -106,6 +121,18 @@ impl Alignment {
         let rotation = (estimated.rotation.inverse() * truth.rotation).scaled_axis();
         NormalizedError::of(&rotation, &(truth.translation - estimated.translation), covariance)
     }
+}
+
+/// Least share of their length by which centres spread sideways to tell the roll about it.
+const MIN_SIDEWAYS: f64 = 0.1;
+
+/// How far points spread across the direction in which they spread most, as a share of that; 0 where they do not spread.
+fn spread_sideways(points: &[Vector3<f64>]) -> f64 {
+    let mean = points.iter().sum::<Vector3<f64>>() / points.len().max(1) as f64;
+    let moments: Matrix3<f64> = points.iter().map(|p| (p - mean) * (p - mean).transpose()).sum();
+    let mut squares = moments.symmetric_eigenvalues().map(|square| square.max(0.0));
+    squares.as_mut_slice().sort_by(f64::total_cmp);
+    if squares[2] > 0.0 { (squares[1] / squares[2]).sqrt() } else { 0.0 }
 }
 
 /// The similarity of least squares over centres, in units of their extent, and rotations, in radians.
@@ -241,6 +268,31 @@ mod tests {
         let error = alignment.normalized_error(&estimated["0"], &covariance, &truth["0"]).unwrap();
         // Four millimetres, of which the alignment takes a part.
         assert!(error.rotation < 0.1 && (0.5..6.0).contains(&error.position), "{error:?}");
+    }
+
+    #[test]
+    fn two_images_align_a_component_and_one_does_not() {
+        let turn = UnitQuaternion::from_euler_angles(0.3, -0.8, 1.2);
+        let mapped = Similarity { scale: 2.5, rotation: turn, translation: Vector3::new(4.0, 5.0, 6.0) };
+        let pose = |x: f64| {
+            let rotation = UnitQuaternion::from_euler_angles(0.1 * x, 0.2, -x);
+            Rigid::new(rotation, Vector3::new(x, 0.3 * x, 0.0))
+        };
+        let named = |count: u8| -> BTreeMap<String, Rigid> {
+            (0..count).map(|i| (i.to_string(), pose(f64::from(i)))).collect()
+        };
+        let truth: BTreeMap<String, Rigid> =
+            named(4).iter().map(|(name, pose)| (name.clone(), mapped.transform_pose(pose))).collect();
+        for count in [2, 3] {
+            let estimated = named(count);
+            let alignment = Alignment::of_component(&estimated, &truth).unwrap();
+            let error = alignment.error(&pose(3.0), &truth["3"]);
+            assert!(error.position_m < 1e-9 && error.rotation_deg < 1e-5, "{error:?}");
+        }
+        assert!(Alignment::of_component(&named(1), &truth).is_none());
+        assert!(Alignment::of_component(&named(0), &truth).is_none());
+        let together = named(2).keys().map(|name| (name.clone(), pose(1.0))).collect();
+        assert!(Alignment::of_component(&together, &truth).is_none());
     }
 
     #[test]

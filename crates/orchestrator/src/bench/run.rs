@@ -18,6 +18,7 @@ use crate::dataset::{CameraBook, GeoSource, ImageFolder, SkippedImage, Truth, li
 use crate::error::Hinted;
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, Mode, locate};
+use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::subscribers::StageReport;
 
@@ -50,6 +51,8 @@ pub enum BenchGps {
 pub struct MethodFigures {
     /// Photos that have a pose and the verdict "localized".
     pub registered: usize,
+    /// Of these, photos in other components of the scene than the largest.
+    pub apart: usize,
     /// Centre errors of the registered photos.
     pub position_m: Option<Bounds>,
     /// Rotation errors of the registered photos.
@@ -161,6 +164,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     let estimated = poses_of(&model);
     let true_scene = truth_of(truth.as_ref(), &format!("{kind}/"));
     let alignment = Alignment::of_centres(&estimated, &true_scene);
+    let alignments = alignments_of(&built.scene, &true_scene);
     let scene_errors = alignment.as_ref().map_or_else(Errors::new, |a| errors_of(a, &estimated, &true_scene));
     let scene = scene_figures(files.len(), &built, &model, &estimated, &true_scene, &scene_errors);
     let mut sets = Vec::new();
@@ -196,7 +200,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         skipped.extend(located.skipped.clone());
         warnings.extend(photos.warnings);
         let true_photos = truth_of(truth.as_ref(), &format!("queries/{name}/"));
-        sets.push(set_figures(name, files.len(), target, located, alignment.as_ref(), &true_photos));
+        sets.push(set_figures(name, files.len(), target, located, &alignments, &true_photos));
     }
     let (wall_s, cpu_s) = session.report.totals();
     Ok(DatasetFigures {
@@ -261,6 +265,16 @@ fn errors_of(
     estimated.iter().filter_map(one).collect()
 }
 
+/// How each component of a scene lies in the truth's frame; `None` where the truth does not tell.
+fn alignments_of(scene: &SceneFile, truth: &BTreeMap<String, Rigid>) -> Vec<Option<Alignment>> {
+    let align = |(component, model)| {
+        let poses = poses_of(model);
+        let of_centres = if component == 0 { Alignment::of_centres(&poses, truth) } else { None };
+        of_centres.or_else(|| Alignment::of_component(&poses, truth))
+    };
+    scene.components.iter().enumerate().map(align).collect()
+}
+
 fn scene_figures(
     images: usize,
     built: &Built,
@@ -290,13 +304,13 @@ fn set_figures(
     images: usize,
     target: String,
     located: Located,
-    alignment: Option<&Alignment>,
+    alignments: &[Option<Alignment>],
     truth: &BTreeMap<String, Rigid>,
 ) -> SetFigures {
     let set = located.set.unwrap_or_default();
     let methods = [("single", located.single), ("camset", set.rigid), ("camset+opt", set.refined)];
     let methods = methods
-        .map(|(method, answers)| (method.to_owned(), method_figures(answers, &target, alignment, truth)));
+        .map(|(method, answers)| (method.to_owned(), method_figures(answers, &target, alignments, truth)));
     let methods = BTreeMap::from(methods);
     SetFigures { name, images, target, methods, local_models: located.local_models, advice: set.advice }
 }
@@ -304,28 +318,32 @@ fn set_figures(
 fn method_figures(
     answers: Vec<PhotoLocalization>,
     target: &str,
-    alignment: Option<&Alignment>,
+    alignments: &[Option<Alignment>],
     truth: &BTreeMap<String, Rigid>,
 ) -> MethodFigures {
-    let posed: BTreeMap<String, Rigid> =
-        answers.iter().filter_map(|photo| Some((photo.name.clone(), photo.world_from_camera?))).collect();
-    let registered: Vec<&str> = answers
-        .iter()
-        .filter(|photo| photo.verdict == Verdict::Localized && photo.world_from_camera.is_some())
-        .map(|photo| photo.name.as_str())
-        .collect();
-    let of_all = alignment.map_or_else(Errors::new, |alignment| errors_of(alignment, &posed, truth));
+    let is_registered =
+        |photo: &&PhotoLocalization| photo.verdict == Verdict::Localized && photo.world_from_camera.is_some();
+    let apart = answers.iter().filter(is_registered).filter(|photo| photo.component > 0).count();
+    let registered: Vec<&str> =
+        answers.iter().filter(is_registered).map(|photo| photo.name.as_str()).collect();
+    let of_component = |photo: &PhotoLocalization| alignments.get(photo.component)?.as_ref();
+    let error = |photo: &PhotoLocalization| {
+        let error = of_component(photo)?.error(&photo.world_from_camera?, truth.get(&photo.name)?);
+        Some((photo.name.clone(), error))
+    };
+    let of_all: Errors = answers.iter().filter_map(error).collect();
     let mut errors = of_all.clone();
     errors.retain(|name, _| registered.contains(&name.as_str()));
     let normalized = |photo: &PhotoLocalization| {
         let (pose, covariance) = (photo.world_from_camera?, photo.covariance?);
-        let error = alignment?.normalized_error(&pose, &covariance, truth.get(&photo.name)?)?;
+        let error = of_component(photo)?.normalized_error(&pose, &covariance, truth.get(&photo.name)?)?;
         Some((photo.name.clone(), error))
     };
     let normalized: BTreeMap<String, NormalizedError> = answers.iter().filter_map(normalized).collect();
     let of_registered = normalized.iter().filter(|(name, _)| errors.contains_key(*name));
     MethodFigures {
         registered: registered.len(),
+        apart,
         position_m: Bounds::of(errors.values().map(|error| error.position_m)),
         rotation_deg: Bounds::of(errors.values().map(|error| error.rotation_deg)),
         target: errors.get(target).copied(),

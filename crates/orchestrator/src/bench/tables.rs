@@ -11,8 +11,7 @@ pub fn markdown_tables(figures: &DatasetFigures) -> String {
     let mut text = format!("# {}\n\n## Scene\n\n", figures.dataset);
     scene_table(&mut text, figures);
     if !figures.sets.is_empty() {
-        text +=
-            "\n## Registration rate\n\nRegistered: has a pose and the verdict \"localized\".\n\n| method |";
+        text += "\n## Registration rate\n\nRegistered: has a pose and the verdict \"localized\". Apart: of these, in other components than the largest.\n\n| method |";
         for set in &figures.sets {
             add(&mut text, format_args!(" {} #reg./#total | rate |", set.name));
         }
@@ -21,12 +20,14 @@ pub fn markdown_tables(figures: &DatasetFigures) -> String {
         for method in METHODS {
             add(&mut text, format_args!("\n| {method} |"));
             for set in &figures.sets {
-                let registered = set.methods.get(method).map_or(0, |figures| figures.registered);
+                let [registered, apart] =
+                    set.methods.get(method).map_or([0; 2], |figures| [figures.registered, figures.apart]);
                 let rate = 100.0 * registered as f64 / set.images.max(1) as f64;
-                add(&mut text, format_args!(" {registered}/{} | {rate:.2} % |", set.images));
+                let apart = if apart > 0 { format!(" ({apart} apart)") } else { String::new() };
+                add(&mut text, format_args!(" {registered}/{}{apart} | {rate:.2} % |", set.images));
             }
         }
-        text += "\n\n## Location error (m / deg)\n\nOver the registered photos, after aligning the scene to the truth by its images' centres.\n\n";
+        text += "\n\n## Location error (m / deg)\n\nOver the registered photos, after aligning each component of the scene to the truth by its images' centres (few or in a line: by their rotations, too).\n\n";
         text += "| set | method | #reg./#total | min | median | max | mean | target |\n|---|---|---|---|---|---|---|---|\n";
         for set in &figures.sets {
             for method in METHODS {
@@ -137,14 +138,14 @@ fn calibration_table(text: &mut String, figures: &DatasetFigures) {
     }
 }
 
-/// One line an image and method. The last two columns are the squared errors per coordinate in what the covariance
-/// states.
+/// One line an image and method. The last columns are the squared errors per coordinate in what the covariance states, and
+/// the component of the scene, 0 the largest.
 pub fn errors_csv(figures: &DatasetFigures) -> String {
     let mut text = String::from(
-        "set,method,name,position_m,rotation_deg,verdict,inliers,reasons,normalized_position,normalized_rotation\n",
+        "set,method,name,position_m,rotation_deg,verdict,inliers,reasons,normalized_position,normalized_rotation,component\n",
     );
     for (name, error) in &figures.scene_errors {
-        add(&mut text, format_args!(",scene,{name},{},{},,,,,\n", error.position_m, error.rotation_deg));
+        add(&mut text, format_args!(",scene,{name},{},{},,,,,,0\n", error.position_m, error.rotation_deg));
     }
     for set in &figures.sets {
         for (method, of_method) in &set.methods {
@@ -159,8 +160,8 @@ pub fn errors_csv(figures: &DatasetFigures) -> String {
                 add(
                     &mut text,
                     format_args!(
-                        "{},{method},{},{error},{verdict:?},{inliers},\"{reasons}\",{normalized}\n",
-                        set.name, photo.name
+                        "{},{method},{},{error},{verdict:?},{inliers},\"{reasons}\",{normalized},{}\n",
+                        set.name, photo.name, photo.component
                     ),
                 );
             }

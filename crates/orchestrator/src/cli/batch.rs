@@ -137,7 +137,7 @@ fn run_scene(progress: &mut Progress, entry: &SceneEntry, variant: &Variant, pla
         let set_name = format!("{name}/{}", set.name);
         if built {
             let locate = locate_args(set, &scene, &folder, places);
-            progress.part(set_name, || Ok(super::locate::locate_photos(&locate)?.1));
+            progress.part(set_name, || Ok(super::locate::locate_photos(&locate)?.2));
         } else {
             progress.skip(set_name);
         }

@@ -3,6 +3,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use serde_json::{Value, json};
+use setloc_camset::PhotoLocalization;
 use setloc_sfm::Rigid;
 
 use super::Answer;
@@ -165,8 +166,8 @@ pub fn write_figures(folder: &Path, figures: &DatasetFigures) -> Result<()> {
     let html = page(&figures.dataset, &figures_section(figures));
     write_atomically(&folder.join("report.html"), html.as_bytes())?;
     write_atomically(&folder.join("errors.csv"), errors_csv(figures).as_bytes())?;
-    let scene =
-        figures.model.images.iter().filter_map(|image| Some((image.name.clone(), image.world_from_camera?)));
+    let scene = figures.model.images.iter();
+    let scene = scene.filter_map(|image| Some((image.name.as_str(), (image.world_from_camera?, 0))));
     write_json(&folder.join("poses.json"), &peers_poses(&scene.collect()))?;
     write_atomically(
         &folder.join("top_view.png"),
@@ -175,14 +176,16 @@ pub fn write_figures(folder: &Path, figures: &DatasetFigures) -> Result<()> {
     for set in &figures.sets {
         for (method, of_method) in &set.methods {
             let answers = of_method.answers.iter();
-            let poses: BTreeMap<String, Rigid> =
-                answers.filter_map(|photo| Some((photo.name.clone(), photo.world_from_camera?))).collect();
+            let pose = |photo: &PhotoLocalization| Some((photo.world_from_camera?, photo.component));
+            let poses: BTreeMap<&str, (Rigid, usize)> =
+                answers.filter_map(|photo| Some((photo.name.as_str(), pose(photo)?))).collect();
             let file = |name: &str| -> PathBuf {
                 folder.join("sets").join(&set.name).join(format!("{method}.{name}"))
             };
             write_json(&file("poses.json"), &peers_poses(&poses))?;
             let mut markers = scene_markers(&figures.model, &BTreeSet::new());
-            for (name, world_from_camera) in &poses {
+            // The picture is of the largest component.
+            for (name, (world_from_camera, _)) in poses.iter().filter(|(_, (_, component))| *component == 0) {
                 let color = if *name == set.target { [220, 30, 30] } else { [240, 150, 0] };
                 markers.push(Marker { world_from_camera: *world_from_camera, color, directed: true });
             }
@@ -192,15 +195,18 @@ pub fn write_figures(folder: &Path, figures: &DatasetFigures) -> Result<()> {
     Ok(())
 }
 
-/// `{name: {"R": camera-from-world rows, "C": centre}}`.
-fn peers_poses(poses: &BTreeMap<String, Rigid>) -> Value {
-    let one = |(name, pose): (&String, &Rigid)| {
+/// `{name: {"R": camera-from-world rows, "C": centre, "component": 0 for the largest}}`.
+fn peers_poses(poses: &BTreeMap<&str, (Rigid, usize)>) -> Value {
+    let one = |(name, (pose, component)): (&&str, &(Rigid, usize))| {
         let rotation = pose.rotation.inverse().to_rotation_matrix();
         let rows: Vec<Vec<f64>> =
             rotation.matrix().row_iter().map(|row| row.iter().copied().collect()).collect();
         (
-            name.clone(),
-            json!({ "R": rows, "C": [pose.translation.x, pose.translation.y, pose.translation.z] }),
+            (*name).to_owned(),
+            json!({
+                "R": rows, "C": [pose.translation.x, pose.translation.y, pose.translation.z],
+                "component": component,
+            }),
         )
     };
     Value::Object(poses.iter().map(one).collect())

@@ -262,7 +262,7 @@ pub fn summarize(scene: &SceneFile, images: usize) {
 const MOST_NAMED: usize = 20;
 
 /// Names in a line, and how many more there are.
-fn listed(names: &[&str]) -> String {
+pub(super) fn listed(names: &[&str]) -> String {
     let (named, rest) = names.split_at(names.len().min(MOST_NAMED));
     let others = if rest.is_empty() { String::new() } else { format!(" and {} others", rest.len()) };
     format!("{}{others}", named.join(", "))

@@ -10,7 +10,7 @@ use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage};
 use super::Answer;
 use super::args::LocateArgs;
 use super::build::{
-    export_folder, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
+    export_folder, listed, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
 };
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use crate::error::Hinted;
@@ -21,6 +21,7 @@ use crate::print;
 use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::store::write_atomically;
+use crate::text::apart;
 
 /// Red, for the target.
 const TARGET_COLOR: [u8; 3] = [220, 30, 30];
@@ -29,15 +30,15 @@ const PHOTO_COLOR: [u8; 3] = [240, 150, 0];
 
 /// `setloc locate`
 pub fn run(args: &LocateArgs) -> Result<Answer> {
-    let (located, answer) = locate_photos(args)?;
+    let (scene, located, answer) = locate_photos(args)?;
     for (method, photo) in located.answers() {
-        print::data(&line(method, photo));
+        print::data(&line(method, photo, &scene));
     }
     Ok(answer)
 }
 
 /// Locates the photos and writes the output folder; the answer is negative when the target is not localized.
-pub fn locate_photos(args: &LocateArgs) -> Result<(Located, Answer)> {
+pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answer)> {
     let config = args.run.config()?;
     let scene = SceneFile::read(&args.scene)?;
     let files = list_images(&args.photos)?;
@@ -71,7 +72,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Located, Answer)> {
         Some(output) => write_grown(output, &session, &photos, &what, (&target, &located))?,
         None => true,
     };
-    Ok((located, if found && grown { Answer::Done } else { Answer::Negative }))
+    Ok((what.scene, located, if found && grown { Answer::Done } else { Answer::Negative }))
 }
 
 /// Writes the scene that has grown, with its exports; false when there is nothing to grow by.
@@ -84,9 +85,18 @@ fn write_grown(
 ) -> Result<bool> {
     let name = session.store.name_of("grow", output);
     let Some(grown) = grow(session, photos, what, (&name, target), located)? else {
-        let is_localized = |(_, photo): &(&str, &PhotoLocalization)| photo.verdict == Verdict::Localized;
-        let (reason, hint) = if located.answers().iter().any(is_localized) {
+        let is_localized = |component: Option<usize>| {
+            let in_it = |photo: &PhotoLocalization| component.is_none_or(|at| photo.component == at);
+            let answers = located.answers();
+            answers.iter().any(|(_, photo)| photo.verdict == Verdict::Localized && in_it(photo))
+        };
+        let (reason, hint) = if is_localized(Some(0)) {
             ("all photos that are localized are in the scene", "name photos that it has not grown by yet")
+        } else if is_localized(None) {
+            (
+                "photos are localized in other components than the largest only, which alone grows",
+                "build the scene with panoramas between its components",
+            )
         } else {
             (
                 "no photo is localized",
@@ -101,6 +111,13 @@ fn write_grown(
     write_atomically(output, &grown.file)?;
     write_models(&export, &grown.scene, &BTreeMap::new())?;
     write_report(&export, (&grown.scene, grown.hash), &[], &[], session)?;
+    let apart = located.answers().into_iter().map(|(_, photo)| photo);
+    let apart = apart.filter(|photo| photo.verdict == Verdict::Localized && photo.component > 0);
+    let apart: Vec<&str> = apart.map(|photo| photo.name.as_str()).collect();
+    if !apart.is_empty() {
+        let why = "localized in other components than the largest, which alone grows";
+        print::note(&format!("not added: {}: {why}", listed(&apart)));
+    }
     if let Some(note) = grown.scene.notes.last() {
         print::note(note);
     }
@@ -141,12 +158,17 @@ fn find_target(wanted: Option<&str>, files: &[(String, PathBuf)]) -> Result<Stri
     }
 }
 
-/// Tab-separated: name, verdict, method, inliers, centre, rotation.
-fn line(method: &str, photo: &PhotoLocalization) -> String {
+/// Tab-separated: name, verdict, method, inliers, centre, rotation, and the component where the frame is its own.
+fn line(method: &str, photo: &PhotoLocalization, scene: &SceneFile) -> String {
     let verdict = photo.verdict.in_words();
     let pose = photo.world_from_camera.as_ref().map_or_else(String::new, |pose| {
         let (c, q) = (pose.translation, pose.rotation.quaternion());
-        format!("\t{:.4} {:.4} {:.4}\t{:.6} {:.6} {:.6} {:.6}", c.x, c.y, c.z, q.w, q.i, q.j, q.k)
+        let frame = if scene.shares_frame(photo.component) {
+            String::new()
+        } else {
+            format!("\t{}", apart(photo.component))
+        };
+        format!("\t{:.4} {:.4} {:.4}\t{:.6} {:.6} {:.6} {:.6}{frame}", c.x, c.y, c.z, q.w, q.i, q.j, q.k)
     });
     format!("{}\t{verdict}\t{method}\t{}{pose}", photo.name, photo.inliers)
 }
@@ -163,19 +185,19 @@ fn write_results(
     let best: Vec<PhotoLocalization> = answers.iter().map(|(_, photo)| (*photo).clone()).collect();
     let set = located.set.as_ref();
     let of_set = |photos: Option<&Vec<PhotoLocalization>>| {
-        localizations_json(photos.map_or(&[], Vec::as_slice), scene.origin)
+        localizations_json(photos.map_or(&[], Vec::as_slice), scene)
     };
-    let mut photos = localizations_json(&best, scene.origin);
+    let mut photos = localizations_json(&best, scene);
     for (photo, (method, _)) in photos.as_array_mut().into_iter().flatten().zip(&answers) {
         photo["method"] = json!(method);
     }
     write_json(
         &folder.join("poses.json"),
         &json!({
-            "convention": "X_world = R(q) X_camera + center; camera x right, y down, z forward",
+            "convention": "X_world = R(q) X_camera + center; camera x right, y down, z forward; component: index in the scene's components, 0 the largest",
             "target": target, "geo_origin": scene.origin, "photos": photos,
             "methods": {
-                "single": localizations_json(&located.single, scene.origin),
+                "single": localizations_json(&located.single, scene),
                 "camset": of_set(set.map(|set| &set.rigid)), "camset+opt": of_set(set.map(|set| &set.refined)),
             },
             "local_models": located.local_models, "advice": set.map(|set| &set.advice), "skipped": located.skipped,
@@ -187,7 +209,9 @@ fn write_results(
     let mut markers = scene_markers(model, &scene.grown_names());
     let mut merged = model.clone();
     for photo in &best {
-        let Some(world_from_camera) = photo.world_from_camera else { continue };
+        // What has a frame of its own is in `poses.json` only.
+        let in_frame = photo.world_from_camera.filter(|_| scene.shares_frame(photo.component));
+        let Some(world_from_camera) = in_frame else { continue };
         let color = if photo.name == target { TARGET_COLOR } else { PHOTO_COLOR };
         markers.push(Marker { world_from_camera, color, directed: true });
         let camera = CameraId(merged.cameras.len() as u32);

@@ -9,6 +9,7 @@ use super::{Digest, ImageRow, Standing};
 use crate::dataset::SkippedImage;
 use crate::error::Hinted;
 use crate::subscribers::StageReport;
+use crate::text::apart;
 
 /// An image of a scene with fewer observations than this share of the median is named as weak.
 const WEAK_SHARE: f64 = 0.2;
@@ -34,6 +35,9 @@ struct Component {
     points: usize,
     observations: usize,
     images: Vec<SceneImage>,
+    /// Whether its frame is not that of the largest.
+    #[serde(default)]
+    own_frame: bool,
 }
 
 #[derive(Deserialize)]
@@ -64,6 +68,12 @@ struct Photo {
     inliers: usize,
     reasons: Vec<String>,
     sigma: Option<Sigma>,
+    world_from_camera: Option<IgnoredAny>,
+    #[serde(default)]
+    component: usize,
+    /// Whether its pose is not in the frame of the largest component.
+    #[serde(default)]
+    own_frame: bool,
 }
 
 #[derive(Deserialize)]
@@ -136,24 +146,35 @@ fn of_scene(name: &str, scene: ScenePoses, skipped: Vec<SkippedImage>) -> Digest
             ..Digest::default()
         };
     };
-    let registered = main.images.iter().filter(|image| image.world_from_camera.is_some()).count();
+    let registered_in =
+        |model: &Component| model.images.iter().filter(|image| image.world_from_camera.is_some()).count();
+    let registered = registered_in(main);
+    let apart: usize = scene.components.iter().skip(1).map(registered_in).sum();
     let grown = main.images.iter().filter(|image| image.grown).count();
     let built = main.images.iter().filter(|image| !image.grown);
     let mut observations: Vec<usize> = built.map(|image| image.observations).collect();
     observations.sort_unstable();
     let least = WEAK_SHARE * observations.get(observations.len() / 2).map_or(0.0, |&median| median as f64);
     let row = |image: &SceneImage| {
-        let (standing, verdict) = match &image.world_from_camera {
-            None => (Standing::Bad, "not registered"),
-            Some(_) if image.grown => (Standing::Good, "added by growth"),
-            Some(_) if (image.observations as f64) < least => (Standing::Weak, "weakly tied"),
-            Some(_) => (Standing::Good, "registered"),
+        let others = scene.components.iter().enumerate().skip(1);
+        let mut others = others.filter(|_| image.world_from_camera.is_none());
+        let elsewhere = others.find_map(|(at, component)| {
+            let is_it = |other: &&SceneImage| other.name == image.name && other.world_from_camera.is_some();
+            component.images.iter().find(is_it).map(|image| (at, image))
+        });
+        let (standing, verdict) = match (&image.world_from_camera, elsewhere) {
+            (None, None) => (Standing::Bad, "not registered".to_owned()),
+            (None, Some((at, _))) => (Standing::Good, format!("registered in component {}", at + 1)),
+            (Some(_), _) if image.grown => (Standing::Good, "added by growth".to_owned()),
+            (Some(_), _) if (image.observations as f64) < least => (Standing::Weak, "weakly tied".to_owned()),
+            (Some(_), _) => (Standing::Good, "registered".to_owned()),
         };
+        let observations = elsewhere.map_or(image.observations, |(_, image)| image.observations);
         ImageRow {
             name: image.name.clone(),
             standing,
-            verdict: verdict.to_owned(),
-            evidence: format!("{} observations", image.observations),
+            verdict,
+            evidence: format!("{observations} observations"),
             reasons: Vec::new(),
             is_target: false,
         }
@@ -173,16 +194,19 @@ fn of_scene(name: &str, scene: ScenePoses, skipped: Vec<SkippedImage>) -> Digest
         advice.push(format!("weakly tied: {weak}; panoramas beside them would make them firm"));
     }
     if scene.components.len() > 1 {
+        let is_apart = scene.components.iter().any(|component| component.own_frame);
         advice.push(format!(
-            "the scene falls into {} parts, of which only the largest is used: panoramas between them would join them",
-            scene.components.len()
+            "the scene falls into {} parts{}: panoramas between them would join them",
+            scene.components.len(),
+            if is_apart { ", not all in one frame" } else { "" }
         ));
     }
     Digest {
         title: format!("Scene {name}"),
         headline: format!(
-            "{registered} of {} images registered{}, {} points, {} observations.",
+            "{registered} of {} images registered{}{}, {} points, {} observations.",
             main.images.len(),
+            if apart > 0 { format!(", {apart} in other components") } else { String::new() },
             if grown > 0 { format!(", {grown} of them added by growth") } else { String::new() },
             main.points,
             main.observations
@@ -207,12 +231,14 @@ fn of_photos(name: &str, located: LocatedPoses) -> Digest {
         let precision = photo.sigma.map_or_else(String::new, |sigma| {
             format!(", σ {:.3} and {:.3}°", sigma.position, sigma.rotation_deg)
         });
+        let is_apart = photo.world_from_camera.is_some() && photo.own_frame;
+        let frame = if is_apart { format!(", {}", apart(photo.component)) } else { String::new() };
         ImageRow {
             is_target: photo.name == located.target,
             name: photo.name,
             standing,
             verdict: verdict.to_owned(),
-            evidence: format!("{}, {} inliers{precision}", photo.method, photo.inliers),
+            evidence: format!("{}, {} inliers{precision}{frame}", photo.method, photo.inliers),
             reasons: photo.reasons,
         }
     };

@@ -14,21 +14,35 @@ pub fn pose_json(pose: &Rigid) -> Value {
 /// All cameras and poses of a scene; `grown` are images that it has grown by.
 pub fn scene_json(scene: &SceneFile) -> Value {
     let grown = scene.grown_names();
-    let components: Vec<Value> = scene.components.iter().map(|model| {
-        let model = model.by_name();
-        let observations = observations_of(&model);
-        let images: Vec<Value> = (0..model.images.len() as u32).map(ImageId).map(|id| {
-            let image = &model.images[id.index()];
-            let pose = image.world_from_camera.as_ref();
-            let place = pose.zip(scene.origin).map(|(pose, origin)| Wgs84::from_enu(&pose.translation, origin));
+    let components: Vec<Value> = scene
+        .components
+        .iter()
+        .enumerate()
+        .map(|(component, model)| {
+            let model = model.by_name();
+            let observations = observations_of(&model);
+            let images: Vec<Value> = (0..model.images.len() as u32)
+                .map(ImageId)
+                .map(|id| {
+                    let image = &model.images[id.index()];
+                    let pose = image.world_from_camera.as_ref();
+                    let place = pose
+                        .zip(scene.origin)
+                        .filter(|_| scene.is_placed(component))
+                        .map(|(pose, origin)| Wgs84::from_enu(&pose.translation, origin));
+                    json!({
+                        "name": image.name, "world_from_camera": pose.map(pose_json), "wgs84": place,
+                        "camera": model.camera_of(id), "observations": observations[id.index()],
+                        "grown": grown.contains(image.name.as_str()),
+                    })
+                })
+                .collect();
             json!({
-                "name": image.name, "world_from_camera": pose.map(pose_json), "wgs84": place,
-                "camera": model.camera_of(id), "observations": observations[id.index()],
-                "grown": grown.contains(image.name.as_str()),
+                "points": model.points.len(), "observations": model.observation_count(), "images": images,
+                "own_frame": !scene.shares_frame(component),
             })
-        }).collect();
-        json!({ "points": model.points.len(), "observations": model.observation_count(), "images": images })
-    }).collect();
+        })
+        .collect();
     json!({
         "convention": "X_world = R(q) X_camera + center; camera x right, y down, z forward; pixel (0.5, 0.5) is the first pixel's centre",
         "geo_origin": scene.origin, "components": components, "warnings": scene.warnings,
@@ -44,10 +58,11 @@ fn observations_of(model: &setloc_sfm::Reconstruction) -> Vec<usize> {
     counts
 }
 
-/// Localized photos: pose, camera, verdict, evidence; one sigma in degrees and scene units.
-pub fn localizations_json(photos: &[PhotoLocalization], origin: Option<Wgs84>) -> Value {
+/// Localized photos: component, pose, camera, verdict, evidence; one sigma in degrees and scene units.
+pub fn localizations_json(photos: &[PhotoLocalization], scene: &SceneFile) -> Value {
     let one = |photo: &PhotoLocalization| {
         let pose = photo.world_from_camera.as_ref();
+        let origin = scene.origin.filter(|_| scene.is_placed(photo.component));
         let place = pose.zip(origin).map(|(pose, origin)| Wgs84::from_enu(&pose.translation, origin));
         let covariance = photo
             .covariance
@@ -60,6 +75,7 @@ pub fn localizations_json(photos: &[PhotoLocalization], origin: Option<Wgs84>) -
         });
         json!({
             "name": photo.name, "verdict": photo.verdict, "reasons": photo.reasons, "inliers": photo.inliers,
+            "component": photo.component, "own_frame": !scene.shares_frame(photo.component),
             "world_from_camera": pose.map(pose_json), "wgs84": place, "camera": photo.camera,
             "covariance_rotation_rad_then_centre": covariance, "sigma": sigma,
         })

@@ -3,12 +3,14 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use serde_json::json;
-use setloc_camset::{Growth, GrowthPhoto, PhotoLocalization, SetLocalization, SingleLocalization, grow};
+use setloc_camset::{
+    AnywhereLocalization, Growth, GrowthPhoto, PhotoLocalization, SetLocalization, SingleLocalization, grow,
+};
 use setloc_features::ImageFeatures;
 use setloc_index::IndexParams;
-use setloc_sfm::{MapperOutput, Reconstruction};
+use setloc_sfm::MapperOutput;
 
-use super::locate::{LocateJobs, SetJobs, query, scene_of, single_role};
+use super::locate::{EmptyScene, LocateJobs, SetJobs, main_of, query, single_role};
 use super::model::features_role;
 use super::scene::KEPT_FEATURES;
 use crate::codec::{self, Artifact};
@@ -114,10 +116,14 @@ fn growth_of(
         // Local models have the same images in the same order: those whose features exist.
         let Some(found) = inputs.find::<ImageFeatures>(&features_role(at))? else { continue };
         features.push((at, photo, found));
-        single.push(inputs.get::<SingleLocalization>(&single_role(at))?);
+        single.push(inputs.get::<AnywhereLocalization>(&single_role(at))?);
     }
     let queries: Vec<_> = features.iter().map(|(_, photo, features)| query(photo, features)).collect();
-    let by_themselves: Vec<&SingleLocalization> = single.iter().map(|found| &**found).collect();
+    // Only the largest component grows.
+    let by_themselves: Vec<&SingleLocalization> = single
+        .iter()
+        .map(|found| found.components.first().context("a photo was sought in no component"))
+        .collect::<Result<_>>()?;
     let (set, model) = if as_set {
         (Some(inputs.get::<SetLocalization>("set")?), Some(inputs.get::<MapperOutput>("local_model")?))
     } else {
@@ -133,8 +139,8 @@ fn growth_of(
         answer.filter(|_| is_new).map(|(_, answer)| *answer)
     };
     let answers: Vec<Option<&PhotoLocalization>> = features.iter().map(answer).collect();
-    let empty = Reconstruction::default();
-    let scene = scene_of(&what.scene, &empty);
+    let empty = EmptyScene::default();
+    let scene = main_of(&what.scene, &empty);
     let models = model.as_ref().map_or(&[][..], |model| &model.components);
     let mut growth =
         grow(&what.config.growth, &what.config.camset, &scene, (&queries, &by_themselves), &answers, models);
@@ -160,8 +166,8 @@ fn grown_scene(
     let features = growth.photos.iter().map(of_photo).collect::<Result<Vec<_>>>()?;
     let borrowed: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
     let names: Vec<&str> = growth.photos.iter().map(|photo| names[photo.photo].as_str()).collect();
-    let empty = Reconstruction::default();
-    let grown = growth.apply(&scene_of(scene, &empty), &borrowed, &names, index_params);
+    let empty = EmptyScene::default();
+    let grown = growth.apply(&main_of(scene, &empty), &borrowed, &names, index_params);
     let mut components = scene.components.clone();
     components.iter_mut().skip(1).for_each(|model| growth.list_in(model, &names));
     let of_index = ContentHash::of(&serde_json::to_vec(index_params)?);
@@ -175,10 +181,11 @@ fn grown_scene(
         content.push(inputs.hash(&features_role(photo.photo))?);
     }
     components[0] = grown.reconstruction;
+    let indices = std::iter::once(grown.index).chain(scene.indices.iter().skip(1).cloned()).collect();
     let from = growth.photos.iter().map(|photo| photos[photo.photo].hash);
     Ok(SceneFile {
         components,
-        index: grown.index,
+        indices,
         features: blocks,
         notes: scene.notes.iter().cloned().chain([sentence(&growth, &names)]).collect(),
         grown: grown.grown,

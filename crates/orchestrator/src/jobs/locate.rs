@@ -4,10 +4,11 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use serde_json::json;
 use setloc_camset::{
-    QueryPhoto, Scene, SetLocalization, SingleLocalization, Views, likely_images, locate_set, locate_single,
-    match_views,
+    AnywhereLocalization, QueryPhoto, Scene, SetLocalization, SingleLocalization, Views, likely_images,
+    locate_set_anywhere, locate_single_anywhere, match_views,
 };
 use setloc_features::ImageFeatures;
+use setloc_index::SceneIndex;
 use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
 
 use super::model::{ModelJobs, ModelKind, ModelSource, add_model, features_role};
@@ -88,27 +89,28 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
         // The local model has the same images in the same order: those whose features exist.
         let Some(found) = inputs.find::<ImageFeatures>(&features_role(at))? else { continue };
         features.push((photo, found));
-        let by_itself = inputs.find::<SingleLocalization>(&single_role(at))?;
+        let by_itself = inputs.find::<AnywhereLocalization>(&single_role(at))?;
         alone.push(by_itself.with_context(|| format!("{} was not located alone", photo.name))?);
     }
-    let alone: Vec<&SingleLocalization> = alone.iter().map(|found| &**found).collect();
+    let alone: Vec<&AnywhereLocalization> = alone.iter().map(|found| &**found).collect();
     let queries: Vec<QueryPhoto<'_>> =
         features.iter().map(|(photo, features)| query(photo, features)).collect();
-    let empty = Reconstruction::default();
-    let scene = scene_of(&what.scene, &empty);
+    let empty = EmptyScene::default();
+    let components = components_of(&what.scene, &empty);
     let seed = derived_seed(what.seed, &["camset"]);
-    let views = || -> Result<Views> {
-        let likely = likely_images(&scene, &alone, what.config.camset.views.max_images);
+    let views = |scene: &Scene<'_>, alone: &[&SingleLocalization]| -> Result<Views> {
+        let likely = likely_images(scene, alone, what.config.camset.views.max_images);
         let read = |image: usize| match likely.binary_search(&ImageId(image as u32)) {
             Ok(_) => what.scene.features_of(ImageId(image as u32)),
             Err(_) => Ok(None),
         };
         let features = (0..scene.reconstruction.images.len()).map(read).collect::<Result<Vec<_>>>()?;
         let pairs = (&what.config.matching, &what.config.two_view);
-        Ok(match_views(&what.config.camset.views, pairs, &scene, features, &likely, &queries, seed))
+        Ok(match_views(&what.config.camset.views, pairs, scene, features, &likely, &queries, seed))
     };
+    let (params, models) = (&what.config.camset, &model.components);
     let located: SetLocalization =
-        locate_set(&what.config.camset, &scene, &queries, &alone, &model.components, views, seed)?;
+        locate_set_anywhere(params, &components, &queries, &alone, models, views, seed)?;
     Product::new(located)
 }
 
@@ -128,10 +130,11 @@ fn add_single(graph: &mut JobGraph<'_>, photo: &SourceImage, features: JobId, wh
     let (owned, what_here) = (photo.clone(), what.clone());
     let work = move |inputs: &Inputs<'_, '_>| {
         let features = inputs.get::<ImageFeatures>("features")?;
-        let empty = Reconstruction::default();
-        let scene = scene_of(&what_here.scene, &empty);
+        let empty = EmptyScene::default();
+        let components = components_of(&what_here.scene, &empty);
         let seed = derived_seed(what_here.seed, &["single", &owned.hash.to_string()]);
-        Product::new(locate_single(&what_here.config.single, &scene, &query(&owned, &features), seed))
+        let (params, photo) = (&what_here.config.single, query(&owned, &features));
+        Product::new(locate_single_anywhere(params, &components, &photo, seed))
     };
     let single = graph.add(Job {
         kind: "single",
@@ -155,6 +158,28 @@ pub(super) fn query<'a>(photo: &'a SourceImage, features: &'a ImageFeatures) -> 
     QueryPhoto { name: &photo.name, camera: &photo.camera, camera_fixed: photo.camera_fixed, features }
 }
 
-pub(super) fn scene_of<'a>(scene: &'a SceneFile, empty: &'a Reconstruction) -> Scene<'a> {
-    Scene { reconstruction: scene.main().unwrap_or(empty), index: &scene.index, grown: &scene.grown }
+/// Stands for the largest component where there is none.
+pub(super) type EmptyScene = (Reconstruction, SceneIndex);
+
+/// The components of a scene, at least one.
+pub(super) fn components_of<'a>(scene: &'a SceneFile, empty: &'a EmptyScene) -> Vec<Scene<'a>> {
+    let component = |(component, (reconstruction, index))| Scene {
+        component,
+        is_placed: scene.is_placed(component),
+        reconstruction,
+        index,
+        // Only the largest grows.
+        grown: if component == 0 { &scene.grown } else { &[] },
+    };
+    let mut components: Vec<Scene<'a>> =
+        scene.components.iter().zip(&scene.indices).enumerate().map(component).collect();
+    if components.is_empty() {
+        components.push(component((0, (&empty.0, &empty.1))));
+    }
+    components
+}
+
+/// The largest component of a scene.
+pub(super) fn main_of<'a>(scene: &'a SceneFile, empty: &'a EmptyScene) -> Scene<'a> {
+    components_of(scene, empty)[0]
 }

@@ -8,9 +8,9 @@ use anyhow::{Context, Result};
 use serde_json::json;
 use setloc_features::{Camera, ImageFeatures, Match};
 use setloc_sfm::{
-    CameraId, GeoregisterParams, ImageId, InputImage, MapperInput, MapperParams, MapperReport,
-    MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction, TwoViewParams, assess,
-    georegister, reconstruct, verify_pair,
+    CameraId, GeoregisterParams, Georegistration, ImageId, InputImage, MapperInput, MapperParams,
+    MapperReport, MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction, TwoViewParams,
+    assess, georegister, reconstruct, verify_pair,
 };
 
 use super::alignment::add_alignment;
@@ -329,18 +329,28 @@ fn run_model(
     for (at, component) in output.components.iter_mut().enumerate() {
         let report = assess(quality, component, &pairs);
         output.report.warnings.extend(report.sentences(component));
-        if at > 0 {
-            let images: Vec<&str> =
-                component.registered().map(|image| component.images[image.index()].name.as_str()).collect();
-            output.report.warnings.push(format!(
-                "component {} is apart from the largest, in which alone photos are localized: {}",
-                at + 1,
-                images.join(", ")
-            ));
-        }
-        place(&mut output.report, georegistration, component, &positions, at == 0, seed);
+        place(&mut output.report, georegistration, component, &positions, seed);
+        output.report.warnings.extend(apart(at, component, &output.report.georegistrations));
     }
     Product::new(output)
+}
+
+/// Says of another component than the largest that it is none with it, and in which frame photos are localized there.
+fn apart(
+    at: usize,
+    component: &Reconstruction,
+    georegistrations: &[Option<Georegistration>],
+) -> Option<String> {
+    let is_placed = |at: usize| georegistrations.get(at).is_some_and(Option::is_some);
+    let frame = if is_placed(0) && is_placed(at) {
+        "beside which measured positions alone place it"
+    } else {
+        "and photos are localized in it in a frame of its own"
+    };
+    let name = |image: ImageId| component.images[image.index()].name.as_str();
+    let images: Vec<&str> = component.registered().map(name).collect();
+    (at > 0)
+        .then(|| format!("component {} is apart from the largest, {frame}: {}", at + 1, images.join(", ")))
 }
 
 /// Moves a component into the measured frame, when positions were given and fix it.
@@ -349,15 +359,16 @@ fn place(
     params: &GeoregisterParams,
     component: &mut Reconstruction,
     positions: &[Option<MeasuredPosition>],
-    is_main: bool,
     seed: u64,
 ) {
     if positions.iter().flatten().next().is_none() {
+        report.georegistrations.push(None);
         return;
     }
     let upright: Vec<bool> =
         component.images.iter().map(|image| component.cameras[image.camera.index()].is_panoramic()).collect();
     let Some(placed) = georegister(params, component, positions, &upright, seed) else {
+        report.georegistrations.push(None);
         report.warnings.push(
             "the measured positions do not fix where the model lies: it keeps its own frame".to_owned(),
         );
@@ -372,9 +383,7 @@ fn place(
                 .push(format!("the measured position of {name} is {distance:.1} m off and was not used"));
         }
     }
-    if is_main {
-        report.georegistration = Some(placed);
-    }
+    report.georegistrations.push(Some(placed));
 }
 
 /// Stands for an image's name inside models, so that a renamed image leaves them as they are.

@@ -1,14 +1,15 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use anyhow::Result;
 use rayon::prelude::*;
 use serde_json::json;
 use setloc_features::{GeoPosition, ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::{MapperOutput, MeasuredPosition, MergeRecord, Reconstruction, ReconstructionImage};
+use setloc_sfm::{ImageId, MapperOutput, MeasuredPosition, MergeRecord, Reconstruction};
 
 use super::choose_pairs;
 use super::model::{ModelKind, ModelSource, add_model, features_role, image_of_place_holder, with_names};
+use crate::artifacts::SceneIndices;
 use crate::codec::Artifact;
 use crate::config::Config;
 use crate::dataset::SourceImage;
@@ -54,14 +55,15 @@ pub fn add_scene(
     let index_params = config.index.clone();
     let index_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
-        let Some(model) = output.components.first() else { return Product::new(SceneIndex::default()) };
         let mut features = Vec::new();
-        for image in &model.images {
+        // All components list the same images.
+        for image in output.components.first().iter().flat_map(|model| &model.images) {
             let at = image_of_place_holder(&image.name).unwrap_or_default();
             features.push(inputs.get::<ImageFeatures>(&features_role(at))?);
         }
         let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
-        Product::new(SceneIndex::build(&index_params, model, &features))
+        let index = |model| SceneIndex::build(&index_params, model, &features);
+        Product::new(SceneIndices(output.components.iter().map(index).collect()))
     };
     let index = graph.add(Job {
         kind: "index",
@@ -81,10 +83,10 @@ pub fn add_scene(
     let params = json!({ "names": names, "origin": origin, "config": config });
     let scene_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
-        let index = inputs.get::<SceneIndex>("index")?;
+        let indices = inputs.get::<SceneIndices>("index")?;
         let ((components, copy), features) = rayon::join(
-            || (output.components.iter().map(|model| named(model, &names)).collect(), (*index).clone()),
-            || features_of_main(inputs, &output),
+            || (output.components.iter().map(|model| named(model, &names)).collect(), indices.0.clone()),
+            || features_of_registered(inputs, &output),
         );
         let features = features?;
         let mut content = vec![inputs.hash("model")?, inputs.hash("index")?];
@@ -92,16 +94,20 @@ pub fn add_scene(
             let at = image_of_place_holder(&image.name).unwrap_or_default();
             content.push(inputs.hash(&features_role(at))?);
         }
+        let recall = worst_recall(&indices.0);
+        let georegistrations = || output.report.georegistrations.iter().map(Option::is_some);
+        let origin = origin.filter(|_| georegistrations().next() == Some(true));
         Product::new(SceneFile {
             components,
-            index: copy,
+            indices: copy,
+            placed: georegistrations().map(|is_placed| is_placed && origin.is_some()).collect(),
             features,
-            origin: output.report.georegistration.as_ref().and(origin),
+            origin,
             warnings: (output.report.warnings.iter().map(|text| with_names(text, &names)))
-                .chain(index.recall().filter(|recall| *recall < MIN_RECALL).map(poor_recall))
+                .chain(recall.as_ref().filter(|recall| recall.share < MIN_RECALL).map(Recall::warning))
                 .collect(),
             notes: (output.report.merges.iter().filter_map(MergeRecord::sentence))
-                .chain(index.recall().map(measured_recall))
+                .chain(recall.as_ref().map(Recall::note))
                 .collect(),
             config: config.clone(),
             grown: Vec::new(),
@@ -134,11 +140,14 @@ pub fn add_scene(
 /// panoramas 60 MB more.
 pub(super) const KEPT_FEATURES: usize = 1024;
 
-/// The strongest features of the registered images of the largest component, as blocks.
-fn features_of_main(inputs: &Inputs<'_, '_>, output: &MapperOutput) -> Result<Vec<Block>> {
-    let Some(model) = output.components.first() else { return Ok(Vec::new()) };
-    let block = |image: &ReconstructionImage| {
-        let (Some(at), Some(_)) = (image_of_place_holder(&image.name), image.world_from_camera) else {
+/// The strongest features of the images that a component has registered, as blocks.
+fn features_of_registered(inputs: &Inputs<'_, '_>, output: &MapperOutput) -> Result<Vec<Block>> {
+    let Some(main) = output.components.first() else { return Ok(Vec::new()) };
+    let registered: BTreeSet<ImageId> =
+        output.components.iter().flat_map(Reconstruction::registered).collect();
+    let block = |id: ImageId| {
+        let name = &main.images[id.index()].name;
+        let Some(at) = image_of_place_holder(name).filter(|_| registered.contains(&id)) else {
             return Ok(Block::default());
         };
         let features = inputs.get::<ImageFeatures>(&features_role(at))?;
@@ -147,26 +156,49 @@ fn features_of_main(inputs: &Inputs<'_, '_>, output: &MapperOutput) -> Result<Ve
         Ok(block)
     };
     // Tens of megabytes are touched first here: on all cores.
-    let blocks: Vec<Result<Block>> = model.images.par_iter().with_max_len(1).map(block).collect();
+    let images = (0..main.images.len() as u32).into_par_iter().with_max_len(1).map(ImageId);
+    let blocks: Vec<Result<Block>> = images.map(block).collect();
     blocks.into_iter().collect()
 }
 
 /// Share of the nearest scene points below which an index is said to miss too many.
 const MIN_RECALL: f64 = 0.95;
 
-fn measured_recall(recall: f64) -> String {
-    format!(
-        "the index finds {:.1} % of the nearest scene points (asked for the scene's own descriptors)",
-        100.0 * recall
-    )
+/// The share of the nearest scene points that an index finds.
+struct Recall {
+    share: f64,
+    /// What it is of, in words.
+    index: String,
 }
 
-fn poor_recall(recall: f64) -> String {
-    format!(
-        "the index misses {:.1} % of the nearest scene points: raise `index.max_candidates` or choose another \
-         `index.backend`",
-        100.0 * (1.0 - recall)
-    )
+/// The poorest recall of some components' indices; `None` where all are exact.
+fn worst_recall(indices: &[SceneIndex]) -> Option<Recall> {
+    let measured = indices.iter().enumerate().filter_map(|(at, index)| Some((at, index.recall()?)));
+    let (at, share) = measured.min_by(|(_, a), (_, b)| a.total_cmp(b))?;
+    let index = match indices.len() {
+        1 => "the index".to_owned(),
+        count => format!("the index of component {}, the poorest of {count},", at + 1),
+    };
+    Some(Recall { share, index })
+}
+
+impl Recall {
+    fn note(&self) -> String {
+        format!(
+            "{} finds {:.1} % of the nearest scene points (asked for the scene's own descriptors)",
+            self.index,
+            100.0 * self.share
+        )
+    }
+
+    fn warning(&self) -> String {
+        format!(
+            "{} misses {:.1} % of the nearest scene points: raise `index.max_candidates` or choose another \
+             `index.backend`",
+            self.index,
+            100.0 * (1.0 - self.share)
+        )
+    }
 }
 
 /// The images in the order of their content (their numbers in it), and the pairs as places in that order.

@@ -29,18 +29,22 @@ pub fn panoramas(folder: &Path, count: u32) -> PathBuf {
     panoramas
 }
 
-/// A small town that can be mapped and located in: `town/panoramas`, `town/queries/lane`.
-pub fn town(folder: &Path) -> PathBuf {
-    let params = TownParams {
+/// A small town that can be mapped and located in.
+pub fn small_town() -> TownParams {
+    TownParams {
         panoramas: 4,
         panorama_step_m: 3.0,
         panorama_width: 768,
         photos: 4,
         photo_width: 480,
         ..TownParams::default()
-    };
+    }
+}
+
+/// It: `town/panoramas`, `town/queries/lane`.
+pub fn town(folder: &Path) -> PathBuf {
     let town = folder.join("town");
-    setloc_town::write_dataset(&town, &params, 92).unwrap();
+    setloc_town::write_dataset(&town, &small_town(), 92).unwrap();
     town
 }
 
