@@ -115,7 +115,7 @@ pub struct SceneIndices(pub Vec<SceneIndex>);
 
 serde_artifact!(LikelyImages, "likely images", 1);
 serde_artifact!(VerifiedPair, "verified pair", 1);
-serde_artifact!(MapperOutput, "model", 7);
+serde_artifact!(MapperOutput, "model", 8);
 serde_artifact!(SceneIndices, "index", 2);
 serde_artifact!(AnywhereLocalization, "photo localization", 3);
 serde_artifact!(Growth, "growth", 1);

@@ -5,11 +5,14 @@
 //! over one another rightly, to within centimetres. So patches of the first photo's lower part are sought in the second
 //! as the ground bends them, over all that the pair's covariance allows ([`sight`]); each is found in many places, and
 //! the pose is what most patches agree on ([`corner`]). Which plane the ground is follows from photos whose poses points
-//! tell ([`floor`]).
+//! tell ([`floor`]). Where nothing else tells how long the step is, the ground alone may ([`open`]).
 
 mod corner;
 mod floor;
+mod open;
 mod sight;
+
+pub use open::register_by_ground;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -71,9 +74,9 @@ impl<'a> Corner<'a> {
         let known = floor::pairs(component, length);
         let mut views = BTreeMap::new();
         for image in known.iter().flatten().copied().chain([length.from, length.to]) {
-            let Some(world_from_camera) = pose(image).filter(|_| !views.contains_key(&image)) else {
-                continue;
-            };
+            // The last photo may have no pose yet, and what it has is not used.
+            let of_view = if image == length.to { Some(from) } else { pose(image) };
+            let Some(world_from_camera) = of_view.filter(|_| !views.contains_key(&image)) else { continue };
             let camera = component.camera_of(image);
             views.insert(image, View { camera, world_from_camera, pyramid: load(image)? });
         }
@@ -82,18 +85,25 @@ impl<'a> Corner<'a> {
     }
 
     fn sharpened(&self) -> Option<BaselineLength> {
+        let found = self.by_ground(|sought| match &self.length.either {
+            Some(poses) => one_of(poses, sought),
+            None => sought(&self.length.step()),
+        })?;
+        let BaselineLength { reference, from, to, votes, .. } = *self.length;
+        BaselineLength::of_step([reference, from, to], &found.pose, self.baseline, votes + found.patches)
+    }
+
+    /// What is chosen where the ground may be sought at a pose.
+    fn by_ground(
+        &self,
+        choose: impl FnOnce(&dyn Fn(&StepPose) -> Option<Sharpened>) -> Option<Sharpened>,
+    ) -> Option<Sharpened> {
         let [from, to] = [self.views.get(&self.length.from)?, self.views.get(&self.length.to)?];
         let pairs: Vec<[&View<'_>; 2]> = (self.known.iter())
             .filter_map(|[first, second]| Some([self.views.get(first)?, self.views.get(second)?]))
             .collect();
         let floor = Floor::find(&pairs, from, self.baseline)?;
-        let sought = |pose: &StepPose| corner::find([from, to], &pose.scaled(self.baseline), &floor);
-        let found = match &self.length.either {
-            Some(poses) => one_of(poses, sought)?,
-            None => sought(&self.length.step())?,
-        };
-        let BaselineLength { reference, from, to, votes, .. } = *self.length;
-        BaselineLength::of_step([reference, from, to], &found.pose, self.baseline, votes + found.patches)
+        choose(&|pose| corner::find([from, to], &pose.scaled(self.baseline), &floor))
     }
 }
 

@@ -22,7 +22,7 @@ mod visibility;
 pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, align_tracks};
 pub use geometry::{Rigid, Similarity};
 pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, georegister};
-pub use ground::sharpen_lengths;
+pub use ground::{register_by_ground, sharpen_lengths};
 pub use mapper::{
     InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,
     MergeVerdict, Mosaic, PutativePair, RegistrationRecord, reconstruct,

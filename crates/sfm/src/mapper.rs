@@ -19,7 +19,7 @@ mod standpoint;
 mod structure;
 #[cfg(test)]
 mod test_street;
-mod wall;
+pub(crate) mod wall;
 mod witnesses;
 
 use std::collections::BTreeMap;
@@ -60,7 +60,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 24;
+pub const MAPPER_VERSION: u32 = 25;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -268,8 +268,22 @@ pub struct MapperReport {
 pub struct MapperOutput {
     /// Connected components, largest first.
     pub components: Vec<Reconstruction>,
+    /// Verified pairs of an image of a component and one of none.
+    pub open_pairs: Vec<PairGeometry>,
     /// What happened.
     pub report: MapperReport,
+}
+
+impl MapperOutput {
+    /// Those of some pairs that are of an image of a component and one of none.
+    pub fn open_among(&self, pairs: &[PairGeometry]) -> Vec<PairGeometry> {
+        let is_registered = |image: ImageId| {
+            let poses = self.components.iter().map(|model| model.images[image.index()].world_from_camera);
+            poses.flatten().next().is_some()
+        };
+        let is_open = |pair: &&PairGeometry| is_registered(pair.first) != is_registered(pair.second);
+        pairs.iter().filter(is_open).cloned().collect()
+    }
 }
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
@@ -367,7 +381,7 @@ fn finished(
         }
         components.push(component);
     }
-    MapperOutput { components, report }
+    MapperOutput { components, open_pairs: Vec::new(), report }
 }
 
 /// The part with further observations of its points, where images have few.

@@ -4,10 +4,10 @@ use std::convert::Infallible;
 use std::sync::Arc;
 
 use nalgebra::{Matrix6, UnitQuaternion, Vector2, Vector3};
-use setloc_features::{Camera, DecodedImage, ImagePyramid};
+use setloc_features::{Camera, DecodedImage, ImageFeatures, ImagePyramid, Keypoint, Match};
 use setloc_sfm::{
-    BaselineLength, CameraId, ImageId, Observation, Reconstruction, ReconstructionImage, ReconstructionPoint,
-    Rigid, StepPose, sharpen_lengths,
+    BaselineLength, CameraId, ImageId, Observation, PairGeometry, Reconstruction, ReconstructionImage,
+    ReconstructionPoint, Rigid, StepPose, TwoView, TwoViewKind, register_by_ground, sharpen_lengths,
 };
 
 /// Height of the cameras over the ground, and steps along the street.
@@ -144,7 +144,9 @@ impl Street {
     /// Error of the last pose in its frame, in radians and metres, and its square in stated deviations per coordinate.
     fn error(&self) -> (f64, f64, f64) {
         let length = &self.component.lengths[0];
-        let baseline = (self.truth[2].translation - self.truth[1].translation).norm();
+        let [reference, from] =
+            [length.reference, length.from].map(|image| self.truth[image.index()].translation);
+        let baseline = (from - reference).norm();
         let exact = self.truth[2].inverse() * self.truth[3];
         let turn = (exact.rotation.inverse() * length.pose.rotation).scaled_axis();
         let shift = length.pose.translation - exact.translation / baseline;
@@ -206,4 +208,83 @@ fn other_paving_tells_nothing_of_two_poses() {
     let before = street.component.lengths.clone();
     assert_eq!(street.sharpen(), 0);
     assert_eq!(street.component.lengths, before);
+}
+
+/// A street whose last photo has no pose, and shares 300 matches on the house across with the one before.
+struct Waiting {
+    street: Street,
+    pair: PairGeometry,
+    features: Vec<ImageFeatures>,
+}
+
+impl Waiting {
+    fn new(salts: [u64; 2]) -> Self {
+        let mut street = Street::new(salts);
+        street.component.images[3].world_from_camera = None;
+        street.component.lengths.clear();
+        let camera = &street.component.cameras[0];
+        let (width, height) = (camera.width, camera.height);
+        let mut features = vec![ImageFeatures { width, height, ..ImageFeatures::default() }; 4];
+        let mut inliers = Vec::new();
+        for number in 0..3000 {
+            let [across, up] = [7, 8].map(|salt| cell(number, 0, salt));
+            let point = Vector3::new(-6.0 + 26.0 * across, 1.0 - 9.0 * up, 30.0);
+            let seen = [2, 3].map(|image| {
+                let in_camera = street.truth[image].inverse_transform_point(&point);
+                let noise = Vector2::new(9, 10).map(|salt| cell(number, image as i64, salt) - 0.5);
+                Some(camera.project(&in_camera)? + noise).filter(|pixel| camera.contains(pixel))
+            });
+            let [Some(first), Some(second)] = seen else { continue };
+            let feature = inliers.len() as u32;
+            if feature == 300 {
+                break;
+            }
+            for (image, pixel) in [(2, first), (3, second)] {
+                features[image].keypoints.push(Keypoint {
+                    x: pixel.x as f32,
+                    y: pixel.y as f32,
+                    size: 5.0,
+                    orientation: 0.0,
+                    noise_px: 0.3,
+                });
+                features[image].colors.push([128; 3]);
+            }
+            inliers.push(Match { first: feature, second: feature });
+        }
+        let second_from_first = street.truth[3].inverse() * street.truth[2];
+        let two_view =
+            TwoView { kind: TwoViewKind::General, second_from_first, inliers, median_parallax_rad: 0.1 };
+        let pair = PairGeometry { first: ImageId(2), second: ImageId(3), two_view };
+        Self { street, pair, features }
+    }
+
+    fn register(&mut self) -> Vec<ImageId> {
+        let images = &self.street.images;
+        let load = |image: ImageId| Ok::<_, Infallible>(Arc::clone(&images[image.index()]));
+        let features: Vec<&ImageFeatures> = self.features.iter().collect();
+        let pairs = std::slice::from_ref(&self.pair);
+        let Ok(registered) = register_by_ground(&mut self.street.component, pairs, &features, load);
+        registered
+    }
+}
+
+#[test]
+fn paving_tells_the_length_of_a_step_before_one_wall() {
+    let mut waiting = Waiting::new([0, 0]);
+    assert_eq!(waiting.register(), [ImageId(3)]);
+    let component = &waiting.street.component;
+    let (turn, shift, _) = waiting.street.error();
+    assert!(turn < 0.002 && shift < 0.05, "{turn} {shift}");
+    let pose = component.images[3].world_from_camera.expect("is registered");
+    assert!((pose.translation - waiting.street.truth[3].translation).norm() < 0.05);
+    let by_both = component.points.iter().filter(|point| point.track.len() == 2).count();
+    assert!(by_both > 200, "{by_both}");
+}
+
+#[test]
+fn other_paving_registers_nothing() {
+    let mut waiting = Waiting::new([0, 1]);
+    let before = waiting.street.component.clone();
+    assert_eq!(waiting.register(), []);
+    assert_eq!(waiting.street.component, before);
 }

@@ -365,7 +365,7 @@ impl Component<'_> {
     fn basis(&self, [_, from, to]: [usize; 3], length: &BaselineLength) -> String {
         let [from, to] = [from, to].map(|slot| self.photos[self.members[slot]].name);
         format!(
-            "the distance of {to} from {from} rests on planes that go on ({} points, ± {:.0} %), not on common points",
+            "the distance of {to} from {from} rests on planes that go on or the ground ({} points, ± {:.0} %), not on common points",
             length.votes,
             100.0 * length.deviation
         )

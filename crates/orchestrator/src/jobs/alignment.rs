@@ -1,13 +1,16 @@
 //! The alignment of a scene's tracks by its images.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::{Context, Result};
 use serde_json::json;
 use setloc_features::ImageFeatures;
-use setloc_sfm::{AlignmentParams, MapperOutput, align_tracks, sharpen_lengths};
+use setloc_sfm::{
+    AlignmentParams, ImageId, MapperOutput, PairGeometry, Reconstruction, align_tracks, register_by_ground,
+    sharpen_lengths,
+};
 
 use super::model::{features_role, image_of_place_holder, read_unchanged};
 use crate::dataset::SourceImage;
@@ -75,6 +78,9 @@ fn run_alignment(
         features.push(inputs.get::<ImageFeatures>(&features_role(*at))?);
     }
     let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
+    let open_pairs = std::mem::take(&mut output.open_pairs);
+    let mut taken: BTreeSet<ImageId> =
+        output.components.iter().flat_map(Reconstruction::registered).collect();
     for component in &mut output.components {
         let wraps: Vec<bool> = component
             .images
@@ -85,9 +91,12 @@ fn run_alignment(
         let report = align_tracks(params, component, &features, camera_fixed, |image| {
             pyramids.get(&sources[image_at[image.index()]], wraps[image.index()])
         })?;
-        sharpen_lengths(component, |image| {
-            pyramids.get(&sources[image_at[image.index()]], wraps[image.index()])
-        })?;
+        let load = |image: ImageId| pyramids.get(&sources[image_at[image.index()]], wraps[image.index()]);
+        sharpen_lengths(component, load)?;
+        let is_waiting =
+            |pair: &&PairGeometry| [pair.first, pair.second].iter().any(|image| !taken.contains(image));
+        let waiting: Vec<PairGeometry> = open_pairs.iter().filter(is_waiting).cloned().collect();
+        taken.extend(register_by_ground(component, &waiting, &features, load)?);
         if report.aligned * 5 < report.sought {
             output.report.warnings.push(format!(
                 "the pixels round only {} of {} matched keypoints agree",

@@ -326,6 +326,9 @@ fn run_model(
         two_view: two_view.clone(),
     };
     let mut output = reconstruct(params, &input_of_mapper, seed);
+    if params.continue_planes {
+        output.open_pairs = output.open_among(&pairs);
+    }
     for (at, component) in output.components.iter_mut().enumerate() {
         let report = assess(quality, component, &pairs);
         output.report.warnings.extend(report.sentences(component));

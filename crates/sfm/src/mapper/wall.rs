@@ -9,7 +9,7 @@
 use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector2, Vector3};
 
 use crate::{
-    Rigid,
+    Rigid, StepPose,
     robust::{
         AngularResidual, RansacParams,
         absolute_pose::turned,
@@ -39,13 +39,13 @@ const ROUNDS: usize = 3;
 /// Groups of neighbouring matches of which each is left out once.
 const GROUPS: usize = 8;
 /// Known planes that count apart.
-pub(super) const PLANES: usize = 2;
+pub(crate) const PLANES: usize = 2;
 /// Rotation, step, normal, logarithm of the wall's distance, and of each known plane's.
 const UNKNOWNS: usize = 9 + PLANES;
 
 /// Matches of two images: bearings in the first image's frame and the second's, and their standard deviations.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Bearings<'a> {
+pub(crate) struct Bearings<'a> {
     pub first: &'a [Vector3<f64>],
     pub second: &'a [Vector3<f64>],
     pub sigmas_first: &'a [f64],
@@ -54,7 +54,7 @@ pub(super) struct Bearings<'a> {
 
 /// A match on a known plane.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct OnPlane {
+pub(crate) struct OnPlane {
     /// The match, by its place in the list.
     pub at: usize,
     /// Number of the plane, below [`PLANES`].
@@ -65,7 +65,7 @@ pub(super) struct OnPlane {
 
 /// Two views of a wall: the second's pose, and the wall in the first's frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct WallPair {
+pub(crate) struct WallPair {
     rotation: Matrix3<f64>,
     /// Of the first image's centre in the second's frame.
     translation: Vector3<f64>,
@@ -78,7 +78,7 @@ pub(super) struct WallPair {
 
 /// The pose with its uncertainty.
 #[derive(Debug, Clone)]
-pub(super) struct Measured {
+pub(crate) struct Measured {
     pub pair: WallPair,
     /// Matches that agree, ascending.
     pub matches: Vec<usize>,
@@ -252,6 +252,20 @@ impl WallPair {
         let (turn, shift) = (turn.rotation.scaled_axis(), other.center() - self.center());
         SVector::from([turn.x, turn.y, turn.z, shift.x, shift.y, shift.z])
     }
+}
+
+/// The poses of the second image, at a step of length one, that a wall leaves by itself, and the matches on it.
+///
+/// The covariances leave out the length, which nothing tells.
+pub(crate) fn steps_by_wall(rays: &Bearings<'_>, seed: u64) -> Vec<(StepPose, Vec<usize>)> {
+    let step = |wall: WallPair| {
+        let measured = wall.scaled(1.0).measure(rays, rays.first.len(), &[], [0.0; PLANES])?;
+        let first_from_second = measured.pair.second_from_first().inverse();
+        let length = first_from_second.translation.norm();
+        let step = StepPose { first_from_second, covariance: measured.covariance };
+        Some((step.scaled(length.recip()), measured.matches))
+    };
+    WallPair::find(rays, seed).into_iter().filter_map(step).collect()
 }
 
 /// The poses of a homography of rays, its plane at distance one and seen in this direction.
