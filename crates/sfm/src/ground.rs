@@ -31,7 +31,7 @@ const MIN_FIRST: f64 = 0.35;
 /// Sharpens the poses of pairs whose length no common points tell ([`Reconstruction::lengths`]), where both photos show
 /// the ground that other photos of the component show too. Returns how many it sharpened.
 ///
-/// `load` gives the pixels of a registered image and is called at most once for each image and length. Equal inputs give
+/// `load` gives the pixels of an image and is called at most once for each image and length. Equal inputs give
 /// equal results on any number of threads.
 ///
 /// # Errors

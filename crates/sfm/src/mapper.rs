@@ -2,7 +2,7 @@
 
 mod adjust;
 mod ambiguity;
-mod continuation;
+pub(crate) mod continuation;
 mod corner;
 mod correspondence;
 mod direction;

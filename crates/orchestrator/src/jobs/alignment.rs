@@ -1,16 +1,13 @@
 //! The alignment of a scene's tracks by its images.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::{Context, Result};
 use serde_json::json;
 use setloc_features::ImageFeatures;
-use setloc_sfm::{
-    AlignmentParams, ImageId, MapperOutput, PairGeometry, Reconstruction, align_tracks, register_by_ground,
-    sharpen_lengths,
-};
+use setloc_sfm::{AlignmentParams, ImageId, MapperOutput, align_tracks, register_by_ground, sharpen_lengths};
 
 use super::model::{features_role, image_of_place_holder, read_unchanged};
 use crate::dataset::SourceImage;
@@ -78,9 +75,7 @@ fn run_alignment(
         features.push(inputs.get::<ImageFeatures>(&features_role(*at))?);
     }
     let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
-    let open_pairs = std::mem::take(&mut output.open_pairs);
-    let mut taken: BTreeSet<ImageId> =
-        output.components.iter().flat_map(Reconstruction::registered).collect();
+    let mut open_pairs = std::mem::take(&mut output.open_pairs);
     for component in &mut output.components {
         let wraps: Vec<bool> = component
             .images
@@ -88,15 +83,11 @@ fn run_alignment(
             .map(|image| component.cameras[image.camera.index()].wraps_around())
             .collect();
         let pyramids = Pyramids::default();
-        let report = align_tracks(params, component, &features, camera_fixed, |image| {
-            pyramids.get(&sources[image_at[image.index()]], wraps[image.index()])
-        })?;
         let load = |image: ImageId| pyramids.get(&sources[image_at[image.index()]], wraps[image.index()]);
+        let report = align_tracks(params, component, &features, camera_fixed, load)?;
         sharpen_lengths(component, load)?;
-        let is_waiting =
-            |pair: &&PairGeometry| [pair.first, pair.second].iter().any(|image| !taken.contains(image));
-        let waiting: Vec<PairGeometry> = open_pairs.iter().filter(is_waiting).cloned().collect();
-        taken.extend(register_by_ground(component, &waiting, &features, load)?);
+        let registered = register_by_ground(component, &open_pairs, &features, load)?;
+        open_pairs.retain(|pair| ![pair.first, pair.second].iter().any(|image| registered.contains(image)));
         if report.aligned * 5 < report.sought {
             output.report.warnings.push(format!(
                 "the pixels round only {} of {} matched keypoints agree",

@@ -55,7 +55,7 @@ const MAX_LN_FALSE_ALARMS: f64 = -7.0;
 const UNLIKE: f64 = 0.4;
 const RIVAL: f64 = 0.75;
 /// Least correlation beyond it of all patches that tells a pose from another far from it. On rendered corners right ones
-/// have 24–50, of ten wrong ones nine have none and one 12.
+/// have 24–50, of eleven wrong ones ten have none and one 12.
 const DECIDING: f64 = 18.0;
 /// Most poses that are compared.
 const MAX_STATES: usize = 12;
@@ -361,8 +361,10 @@ impl Search<'_> {
 
     /// Whether another state puts most patches that agree on this one elsewhere.
     fn are_apart(&self, state: &State, other: &State, agreeing: &[&Sought]) -> bool {
+        let known = [state, other].map(|state| (self.second_from_first(state), self.ground(state)));
         let apart = |sought: &&&Sought| {
-            let places = [state, other].map(|state| self.seen(state, &sought.piece.pixel));
+            let pixel = &sought.piece.pixel;
+            let places = [0, 1].map(|at| self.from.seen_by(self.to, &known[at].0, &known[at].1, pixel));
             let [Some(a), Some(b)] = places else { return true };
             (a - b).norm() > APART * sought.spacing
         };

@@ -10,7 +10,10 @@ use super::{Corner, corner::Sharpened};
 use crate::{
     BaselineLength, ImageId, Observation, PairGeometry, Place, Reconstruction, ReconstructionPoint, Rigid,
     StepPose, TwoViewKind,
-    mapper::wall::{Bearings, steps_by_wall},
+    mapper::{
+        continuation::reference_among,
+        wall::{Bearings, steps_by_wall},
+    },
     solvers::triangulation::{WorldRay, triangulate, triangulation_angle},
 };
 
@@ -26,8 +29,6 @@ const NEAR_TURN_RAD: f64 = 0.0175;
 /// Fewest patches that tell a length by themselves. On nineteen rendered corners seventeen lengths of 66 patches and more
 /// put the photo within 0.07 m, two of 32 and 38 half a metre off.
 const MIN_PATCHES: usize = 50;
-/// Fewest points that two images of a reference baseline share.
-const MIN_REFERENCE_POINTS: usize = 10;
 /// Largest error of an observation of a new point, in standard deviations, and the smallest angle of its rays.
 const MAX_SIGMAS: f64 = 4.0;
 const MIN_ANGLE_RAD: f64 = 0.0175;
@@ -138,20 +139,10 @@ impl Open {
 
 /// The image that shares most points with a registered one and does not stand at the same place.
 fn reference_of(component: &Reconstruction, image: ImageId) -> Option<ImageId> {
-    let center = component.images[image.index()].world_from_camera?.translation;
-    let mut shared: BTreeMap<ImageId, usize> = BTreeMap::new();
-    for point in component.points.iter().filter(|point| point.track.iter().any(|seen| seen.image == image)) {
-        for seen in &point.track {
-            *shared.entry(seen.image).or_default() += 1;
-        }
-    }
-    let is_elsewhere = |(other, count): &(&ImageId, &usize)| {
-        let pose = component.images[other.index()].world_from_camera;
-        pose.is_some_and(|pose| pose.translation != center) && **count >= MIN_REFERENCE_POINTS
-    };
-    let most =
-        shared.iter().filter(is_elsewhere).max_by_key(|(other, count)| (**count, std::cmp::Reverse(**other)));
-    most.map(|(other, _)| *other)
+    let center_of = |image: ImageId| Some(component.images[image.index()].world_from_camera?.translation);
+    let tracks = component.points.iter().map(|point| &point.track[..]);
+    let seen = tracks.filter(|track| track.iter().any(|seen| seen.image == image));
+    reference_among(seen, &center_of(image)?, center_of)
 }
 
 fn rays_of(component: &Reconstruction, features: &[&ImageFeatures], image: ImageId) -> Rays {

@@ -13,6 +13,8 @@
 //!
 //! How well the pair itself is known is told by the homography of the wall that it sees ([`super::wall`]).
 
+use std::collections::BTreeMap;
+
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -190,20 +192,28 @@ fn of_unknown_direction(step: &Vector3<f64>, deviation: f64) -> Matrix6<f64> {
 /// The image that shares most points with this one from another place.
 fn reference_of(model: &Model<'_>, image: ImageId) -> Option<ImageId> {
     let center = model.poses[image.index()].as_ref()?.center();
-    let mut shared = vec![0_usize; model.poses.len()];
-    for (_, id) in model.observations_of(image) {
-        for seen in model.point(id).map_or(&[][..], |point| &point.track) {
-            shared[seen.image.index()] += 1;
-        }
+    let seen = model.observations_of(image);
+    let tracks = seen.iter().filter_map(|(_, id)| Some(&model.point(*id)?.track[..]));
+    reference_among(tracks, center, |other| model.poses[other.index()].as_ref().map(|pose| *pose.center()))
+}
+
+/// The image that these tracks of points show most and that does not stand at `center`; `None` where they show it too
+/// little.
+pub(crate) fn reference_among<'t>(
+    tracks: impl Iterator<Item = &'t [Observation]>,
+    center: &Vector3<f64>,
+    center_of: impl Fn(ImageId) -> Option<Vector3<f64>>,
+) -> Option<ImageId> {
+    let mut shared: BTreeMap<ImageId, usize> = BTreeMap::new();
+    for seen in tracks.flatten() {
+        *shared.entry(seen.image).or_default() += 1;
     }
-    let elsewhere = |other: &ImageId| {
-        model.poses[other.index()].as_ref().is_some_and(|pose| pose.center() != center)
-            && shared[other.index()] >= MIN_REFERENCE_POINTS
-    };
-    model
-        .registered()
-        .filter(elsewhere)
-        .max_by_key(|other| (shared[other.index()], std::cmp::Reverse(*other)))
+    let is_elsewhere = |other: ImageId| center_of(other).is_some_and(|at| at != *center);
+    let (_, std::cmp::Reverse(most)) = (shared.into_iter())
+        .filter(|&(other, count)| count >= MIN_REFERENCE_POINTS && is_elsewhere(other))
+        .map(|(other, count)| (count, std::cmp::Reverse(other)))
+        .max()?;
+    Some(most)
 }
 
 fn known_points(model: &Model<'_>, image: ImageId, center: &Vector3<f64>) -> Vec<SeenPoint> {
