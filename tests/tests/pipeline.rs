@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use setloc_camset::{PhotoLocalization, Verdict};
+use setloc_features::Calibration;
 use setloc_orchestrator::bench::{BenchGps, BenchOptions, DatasetFigures, bench_dataset};
 use setloc_orchestrator::building::{BuildOutcome, build_scene};
 use setloc_orchestrator::config::Config;
@@ -63,6 +64,49 @@ fn the_town_is_mapped_and_its_set_located() {
 }
 
 #[test]
+fn a_set_of_unknown_intrinsics_is_located_and_tells_them() {
+    let folder = tempfile::tempdir().unwrap();
+    stages::write_sample(folder.path()).unwrap();
+    let limits = Limits { threads: 2, memory: 4 << 30 };
+    let store = folder.path().join("store");
+    let session = Session::open(&store, None, limits, Arc::new(AtomicBool::new(false))).unwrap();
+    let read = |part: &str, cameras: &CameraBook| {
+        let files = list_images(&[folder.path().join(part)]).unwrap();
+        ImageFolder::read(&files, cameras, &GeoSource::None, None).unwrap()
+    };
+    let config = Config::default();
+    let panoramas = read("panoramas", &CameraBook::default());
+    let BuildOutcome::Built(built) =
+        build_scene(&session, &panoramas, &config, 0, "scene", None, |_| Ok(())).unwrap()
+    else {
+        panic!("no present hash was given")
+    };
+    let what = LocateJobs { scene: Arc::clone(&built.scene), config, seed: 0 };
+    let known = CameraBook::read(&folder.path().join("cameras.json")).unwrap();
+    let mut by_cameras = [read("queries/lane", &known), read("queries/lane", &CameraBook::default())];
+    let truth = by_cameras[0].images[0].camera.clone();
+    let guess = by_cameras[1].images[0].camera.clone();
+    assert!((guess.focal_length() / truth.focal_length() - 1.0).abs() > 0.2, "{guess:?} {truth:?}");
+    let name = by_cameras[0].images.last().unwrap().name.clone();
+    let [by_known, by_guess] = by_cameras.each_mut().map(|photos| {
+        let set = locate(&session, photos, &what, Mode::Set, "set", &name).unwrap().set.unwrap();
+        let target = set.refined.iter().find(|photo| photo.name == name).unwrap();
+        assert_eq!(target.verdict, Verdict::Localized, "{:?}", target.reasons);
+        target.clone()
+    });
+    let pose = |photo: &PhotoLocalization| photo.world_from_camera.unwrap();
+    let apart = (pose(&by_known).translation - pose(&by_guess).translation).norm();
+    let images = &built.scene.main().unwrap().images;
+    let extent = (pose(&by_known).translation - images[0].world_from_camera.unwrap().translation).norm();
+    assert!(apart < 0.02 * extent, "{apart} of {extent}");
+    let estimated = &by_guess.camera;
+    assert!((estimated.focal_length() / truth.focal_length() - 1.0).abs() < 0.01, "{estimated:?} {truth:?}");
+    // What scenes grow by, and who asks later, has these cameras.
+    assert!(by_cameras[1].images.iter().all(|photo| photo.calibration == Calibration::Estimated));
+    assert!(by_cameras[0].images.iter().all(|photo| photo.calibration == Calibration::Known));
+}
+
+#[test]
 fn photos_localized_earlier_localize_one_that_the_panoramas_do_not() {
     let folder = tempfile::tempdir().unwrap();
     stages::write_sample(folder.path()).unwrap();
@@ -84,18 +128,18 @@ fn photos_localized_earlier_localize_one_that_the_panoramas_do_not() {
     let mut bridging = read("queries/lane");
     // The last one stands too far on for those before it, too.
     bridging.images.pop();
-    let target =
+    let mut target =
         ImageFolder { images: bridging.images.pop().into_iter().collect(), ..ImageFolder::default() };
-    let name = target.images[0].name.clone();
-    let alone = |scene| {
+    let (name, last_one) = (target.images[0].name.clone(), target.images.clone());
+    let mut alone = |scene| {
         let what = LocateJobs { scene, config: config.clone(), seed: 0 };
-        locate(&session, &target, &what, Mode::Single, "alone", &name).unwrap().single[0].clone()
+        locate(&session, &mut target, &what, Mode::Single, "alone", &name).unwrap().single[0].clone()
     };
     assert_ne!(alone(Arc::clone(&built.scene)).verdict, Verdict::Localized);
 
     let what = LocateJobs { scene: Arc::clone(&built.scene), config: config.clone(), seed: 0 };
     let last = bridging.images.last().unwrap().name.clone();
-    let located = locate(&session, &bridging, &what, Mode::Both, "set", &last).unwrap();
+    let located = locate(&session, &mut bridging, &what, Mode::Both, "set", &last).unwrap();
     let grown = grow(&session, &bridging, &what, ("grow", &last), &located).unwrap().unwrap();
     assert_eq!(grown.scene.grown.len(), bridging.images.len());
     assert_ne!(grown.scene.content, built.scene.content);
@@ -103,8 +147,8 @@ fn photos_localized_earlier_localize_one_that_the_panoramas_do_not() {
     assert_eq!(found.verdict, Verdict::Localized, "{:?}", found.reasons);
 
     // With its set, in the scene as it was, it stands at the same place.
-    bridging.images.extend(target.images.clone());
-    let by_set = locate(&session, &bridging, &what, Mode::Set, "whole", &name).unwrap().set.unwrap();
+    bridging.images.extend(last_one);
+    let by_set = locate(&session, &mut bridging, &what, Mode::Set, "whole", &name).unwrap().set.unwrap();
     let by_set = by_set.refined.iter().find(|photo| photo.name == name).unwrap();
     let pose = |photo: &PhotoLocalization| photo.world_from_camera.unwrap();
     let apart = (pose(&found).translation - pose(by_set).translation).norm();

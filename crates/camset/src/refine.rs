@@ -6,8 +6,8 @@ use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector2, Vector3};
 use setloc_features::Camera;
 use setloc_index::SceneIndex;
 use setloc_sfm::bundle::{
-    self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
-    LengthRatio, RobustLoss,
+    self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, CameraPrior,
+    IntrinsicsFreedom, LengthRatio, RobustLoss,
 };
 use setloc_sfm::{ImageId, Place, PointId, Rigid};
 
@@ -19,8 +19,6 @@ use crate::{Scene, SceneMatch};
 /// Scale of the robust loss in standard deviations: at one deviation an observation has half its weight, at four (an
 /// inlier still) a seventeenth, so leftovers among the matches hardly pull.
 const LOSS_SCALE: f64 = 1.0;
-/// Observations that a photo needs before its intrinsics are estimated.
-const MIN_FOR_INTRINSICS: usize = 30;
 
 /// Photos, their cameras and the local points between them, all in the scene's frame.
 #[derive(Debug, Clone)]
@@ -92,8 +90,8 @@ pub(crate) struct TiedPoint {
 /// Moves photos and local points (the paper's T_OPT), scene points within what the scene knows of them; returns
 /// covariances of the poses if asked.
 ///
-/// A camera is estimated only when it is not known and enough observations support it. Poses without any observation
-/// stay where they are.
+/// Cameras that are not known are estimated, from what holds for usual photos on. Poses without any observation stay where
+/// they are.
 pub(crate) fn refine_jointly(
     model: &mut JointModel,
     scene: &Scene<'_>,
@@ -106,7 +104,6 @@ pub(crate) fn refine_jointly(
         points: model.points.iter().map(|&position| BundlePoint { position, fixed: false }).collect(),
         observations: Vec::new(),
         origins: Vec::new(),
-        support: vec![0; model.cameras.len()],
         seen: vec![0; model.photos.len()],
         priors: Vec::new(),
         photos: &model.photos,
@@ -114,18 +111,11 @@ pub(crate) fn refine_jointly(
         rays,
     };
     builder.add_all(scene.index, observed);
-    let Builder { points, mut observations, mut origins, support, seen, priors, .. } = builder;
-    let camera_freedom = support
-        .iter()
-        .zip(&model.camera_fixed)
-        .map(|(&support, &fixed)| {
-            if fixed || support < MIN_FOR_INTRINSICS {
-                IntrinsicsFreedom::FIXED
-            } else {
-                IntrinsicsFreedom::LENS
-            }
-        })
-        .collect();
+    let Builder { points, mut observations, mut origins, seen, priors, .. } = builder;
+    let freedom = |&fixed: &bool| if fixed { IntrinsicsFreedom::FIXED } else { IntrinsicsFreedom::FREE };
+    let camera_freedom: Vec<IntrinsicsFreedom> = model.camera_fixed.iter().map(freedom).collect();
+    let usual = |(at, camera): (usize, &Camera)| CameraPrior::of_usual_photo(at as u32, camera);
+    let camera_priors: Vec<CameraPrior> = model.cameras.iter().enumerate().filter_map(usual).collect();
     let mut poses: Vec<BundlePose> = model
         .photos
         .iter()
@@ -172,8 +162,15 @@ pub(crate) fn refine_jointly(
         observations.push(BundleObservation { pose, point: *point as u32, pixel, noise_px });
         origins.push(Origin::Scene);
     }
-    let mut problem =
-        BundleProblem { cameras, camera_freedom, poses, points, observations, ..BundleProblem::default() };
+    let mut problem = BundleProblem {
+        cameras,
+        camera_freedom,
+        camera_priors,
+        poses,
+        points,
+        observations,
+        ..BundleProblem::default()
+    };
     for (slots, length) in &model.lengths {
         problem.hold_length(slots.map(|slot| standpoints.lead[slot] as u32), *length);
     }
@@ -233,8 +230,6 @@ struct Builder<'a> {
     points: Vec<BundlePoint>,
     observations: Vec<BundleObservation>,
     origins: Vec<Origin>,
-    /// Observations of each camera.
-    support: Vec<usize>,
     /// Observations of each photo's standpoint.
     seen: Vec<usize>,
     priors: Vec<ScenePrior>,
@@ -283,7 +278,6 @@ impl Builder<'_> {
 
     fn observe(&mut self, slot: usize, place: &Place, point: u32, origin: Origin) {
         let photo = &self.photos[slot];
-        self.support[photo.camera] += 1;
         self.seen[photo.standpoint] += 1;
         if let Some(observation) = self.standpoints.observation(self.rays, slot, place, point) {
             self.observations.push(observation);

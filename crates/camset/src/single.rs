@@ -114,7 +114,7 @@ fn solve(
     let best = best_hypothesis(params, scene, photo, matches, seed)?;
     let mut model = JointModel {
         cameras: vec![best.camera],
-        camera_fixed: vec![photo.camera_fixed],
+        camera_fixed: vec![photo.calibration.is_settled()],
         photos: vec![JointPhoto { camera: 0, world_from_camera: best.pose, standpoint: 0 }],
         points: Vec::new(),
         lengths: Vec::new(),
@@ -218,10 +218,10 @@ fn best_hypothesis(
     seed: u64,
 ) -> Option<Hypothesis> {
     let mut subsets = vec![matches.to_vec()];
-    if photo.camera_fixed {
+    if photo.calibration.is_settled() {
         subsets.extend(covisible_subsets(scene.index, matches, params.covisible_images));
     }
-    let cameras: Vec<Camera> = if photo.camera_fixed {
+    let cameras: Vec<Camera> = if photo.calibration.is_settled() {
         vec![photo.camera.clone()]
     } else {
         FOCAL_FACTORS.iter().map(|&factor| with_focal_factor(photo.camera, factor)).collect()
@@ -329,6 +329,8 @@ fn with_focal_factor(camera: &Camera, factor: f64) -> Camera {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use setloc_features::Calibration;
+
     use crate::synthetic::World;
 
     fn locate(world: &World, photo: usize) -> PhotoLocalization {
@@ -372,7 +374,7 @@ mod tests {
         let mut guess = world.camera.clone();
         guess.params[0] = 640.0;
         guess.params[1] = 640.0;
-        let query = QueryPhoto { camera: &guess, camera_fixed: false, ..world.queries()[0] };
+        let query = QueryPhoto { camera: &guess, calibration: Calibration::Guessed, ..world.queries()[0] };
         let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5).photo;
         assert!((found.camera.params[0] / 800.0 - 1.0).abs() < 0.01, "{:?}", found.camera.params);
         let (center, rotation) = world.errors(0, &found.world_from_camera.unwrap());

@@ -8,7 +8,9 @@ use std::collections::BTreeSet;
 use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, MatchParams};
+use setloc_features::{
+    Calibration, Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, MatchParams,
+};
 use setloc_index::{IndexParams, SceneIndex};
 use setloc_sfm::synthetic::normal;
 use setloc_sfm::{
@@ -386,7 +388,7 @@ impl World {
             .map(|(view, name)| QueryPhoto {
                 name,
                 camera: &self.camera,
-                camera_fixed: true,
+                calibration: Calibration::Known,
                 features: &view.features,
             })
             .collect()

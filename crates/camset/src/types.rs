@@ -1,6 +1,6 @@
 use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
-use setloc_features::{Camera, ImageFeatures};
+use setloc_features::{Calibration, Camera, ImageFeatures};
 use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::{ImageId, PointId, Reconstruction, Rigid, Similarity};
 
@@ -37,10 +37,10 @@ pub struct GrownImage {
 pub struct QueryPhoto<'a> {
     /// Name as the user knows it.
     pub name: &'a str,
-    /// Its camera; a guess when `camera_fixed` is false.
+    /// Its camera.
     pub camera: &'a Camera,
-    /// Whether the intrinsics are known.
-    pub camera_fixed: bool,
+    /// How well the camera's intrinsics are known.
+    pub calibration: Calibration,
     /// Its features.
     pub features: &'a ImageFeatures,
 }

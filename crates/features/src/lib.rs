@@ -54,7 +54,9 @@ mod nearby;
 mod patch;
 mod sift;
 
-pub use camera::{Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole, ProjectJacobian, UnprojectJacobian};
+pub use camera::{
+    Calibration, Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole, ProjectJacobian, UnprojectJacobian,
+};
 pub use decode::{
     CameraSource, DecodeLimits, DecodedImage, GPano, GeoPosition, ImageInfo, ImageMetadata, decode,
     guess_camera, probe,

@@ -5,10 +5,11 @@ use std::sync::Arc;
 
 use anyhow::Result;
 use setloc_camset::{AnywhereLocalization, PhotoLocalization, SetLocalization, Verdict};
+use setloc_features::{Calibration, Camera};
 use setloc_sfm::MapperOutput;
 
 use crate::building::alike_pairs;
-use crate::dataset::{ImageFolder, SkippedImage};
+use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, RunResult};
 use crate::jobs::{LocateJobs, LocatedJobs, add_features_of, add_grown, add_set, add_singles};
@@ -52,6 +53,13 @@ impl Located {
     pub fn answers(&self) -> Vec<(&'static str, &PhotoLocalization)> {
         best_answers(&self.single, self.set.as_ref())
     }
+
+    /// How many photos the set localizes, and how many have a pose that is uncertain.
+    fn verdicts(&self) -> (usize, usize) {
+        let photos = || self.set.iter().flat_map(|set| &set.refined);
+        let count = |wanted: Verdict| photos().filter(|photo| photo.verdict == wanted).count();
+        (count(Verdict::Localized), count(Verdict::Uncertain))
+    }
 }
 
 /// The same of photos alone and of their set.
@@ -76,11 +84,14 @@ pub fn best_answers<'a>(
 
 /// Locates photos; `target` is the photo that decides in [`Mode::Auto`].
 ///
+/// Where intrinsics of a set are a guess, the set is located twice: the second time with the cameras that the scene told the
+/// first time, which `folder` has afterwards. Photos alone keep the guess in [`Mode::Both`], which compares methods.
+///
 /// # Errors
 /// When the run was stopped or the store cannot be written.
 pub fn locate(
     session: &Session,
-    folder: &ImageFolder,
+    folder: &mut ImageFolder,
     what: &LocateJobs,
     mode: Mode,
     name: &str,
@@ -97,9 +108,60 @@ pub fn locate(
     let wanted = matches!(mode, Mode::Set | Mode::Both) || (mode == Mode::Auto && !found);
     if wanted {
         whole.absorb(run(session, folder, what, (name, target), (mode == Mode::Both, true), &mut located)?);
+        let images = with_estimated_cameras(&folder.images, located.set.as_ref());
+        if let Some(images) = images {
+            let calibrated = ImageFolder { images, ..folder.clone() };
+            let mut again = Located { set: None, local_models: Vec::new(), ..located.clone() };
+            let alone = mode == Mode::Auto;
+            if alone {
+                again.single.clear();
+            }
+            whole.absorb(run(session, &calibrated, what, (name, target), (alone, true), &mut again)?);
+            if again.verdicts() >= located.verdicts() {
+                (located, *folder) = (again, calibrated);
+            }
+        }
     }
     session.remember(name, &whole)?;
     Ok(located)
+}
+
+/// The images with the cameras that a set's localization tells in place of guessed ones; `None` when it tells none.
+///
+/// Photos of one guess have one camera: that of the component in which most scene points place localized photos of
+/// theirs, else photos whose pose is uncertain.
+fn with_estimated_cameras(images: &[SourceImage], set: Option<&SetLocalization>) -> Option<Vec<SourceImage>> {
+    let placed: BTreeMap<&str, &PhotoLocalization> = set?.refined.iter().map(|p| (&*p.name, p)).collect();
+    let is_guessed = |image: &SourceImage| image.calibration == Calibration::Guessed;
+    let told = |guess: &Camera| {
+        let alike = |image: &&SourceImage| is_guessed(image) && image.camera == *guess;
+        let mut support: Vec<(&Camera, [usize; 2])> = Vec::new();
+        for photo in images.iter().filter(alike).filter_map(|image| placed.get(&*image.name)) {
+            let [localized, uncertain] = match photo.verdict {
+                Verdict::Localized => [photo.inliers, 0],
+                Verdict::Uncertain => [0, photo.inliers],
+                Verdict::NotLocalized => continue,
+            };
+            let known = support.iter().position(|(camera, _)| **camera == photo.camera);
+            let at = known.unwrap_or(support.len());
+            if known.is_none() {
+                support.push((&photo.camera, [0; 2]));
+            }
+            support[at].1[0] += localized;
+            support[at].1[1] += uncertain;
+        }
+        let best = support.into_iter().max_by_key(|(_, points)| *points);
+        best.map(|(camera, _)| camera.clone().with_tangential_distortion())
+    };
+    let estimated = |image: &SourceImage| {
+        let camera = Some(image).filter(|image| is_guessed(image)).and_then(|image| told(&image.camera))?;
+        let (calibration, camera_origin) = (Calibration::Estimated, CameraOrigin::Estimated);
+        Some(SourceImage { camera, calibration, camera_origin, ..image.clone() })
+    };
+    let estimated: Vec<Option<SourceImage>> = images.iter().map(estimated).collect();
+    let any = estimated.iter().any(Option::is_some);
+    let image = |(new, old): (Option<SourceImage>, &SourceImage)| new.unwrap_or_else(|| old.clone());
+    any.then(|| estimated.into_iter().zip(images).map(image).collect())
 }
 
 /// Runs one graph: each photo alone, the set, or both.
@@ -157,7 +219,13 @@ impl LocateGraph<'_> {
         };
         let mut graph = JobGraph::default();
         let jobs = if as_set {
-            let set = add_set(&mut graph, target, &folder.images, &alike, what)?;
+            let mut what = what.clone();
+            if !folder.images.iter().all(|image| image.calibration.is_settled()) {
+                // What this tells of the cameras is for locating it again; what needs them well is left for then.
+                what.config.alignment.enabled = false;
+                what.config.sfm.continue_planes = false;
+            }
+            let set = add_set(&mut graph, target, &folder.images, &alike, &what)?;
             LocatedJobs { features: set.model.features.clone(), single: set.single.clone(), set: Some(set) }
         } else {
             let features = add_features_of(&mut graph, &folder.images, &photos);
@@ -220,9 +288,61 @@ pub fn grow(
 
 #[cfg(test)]
 mod tests {
-    use setloc_features::Camera;
-
     use super::*;
+
+    #[test]
+    fn guessed_cameras_become_those_that_most_of_the_scene_tells() {
+        use Verdict::{Localized, NotLocalized, Uncertain};
+
+        let guess = Camera::from_focal_guess(1600, 1200, 1920.0);
+        let known = Camera::from_focal_guess(1600, 1200, 1111.0);
+        let image = |name: &str, camera: &Camera, calibration| SourceImage {
+            name: name.to_owned(),
+            path: std::path::PathBuf::new(),
+            hash: ContentHash::of(name.as_bytes()),
+            camera: camera.clone(),
+            calibration,
+            camera_origin: CameraOrigin::Listed,
+            position: None,
+            mask: None,
+        };
+        let guessed = |name: &str| image(name, &guess, Calibration::Guessed);
+        let images =
+            [guessed("a"), guessed("b"), guessed("c"), guessed("d"), image("k", &known, Calibration::Known)];
+        let with_focal = |focal: f64| Camera::from_focal_guess(1600, 1200, focal);
+        let photo = |name: &str, focal: f64, inliers, verdict| PhotoLocalization {
+            name: name.to_owned(),
+            camera: with_focal(focal),
+            component: 0,
+            world_from_camera: None,
+            covariance: None,
+            inliers,
+            verdict,
+            reasons: Vec::new(),
+        };
+        let told = |refined: Vec<PhotoLocalization>| {
+            let set = SetLocalization { refined, ..SetLocalization::default() };
+            let images = with_estimated_cameras(&images, Some(&set))?;
+            assert_eq!((&images[4].camera, images[4].calibration), (&known, Calibration::Known));
+            let same = |image: &SourceImage| {
+                image.camera == images[0].camera && image.calibration == Calibration::Estimated
+            };
+            assert!(images[..4].iter().all(same));
+            Some(images[0].camera.focal_length())
+        };
+        let by_two = vec![
+            photo("a", 1500.0, 60, Localized),
+            photo("b", 1200.0, 50, Localized),
+            photo("c", 1200.0, 20, Localized),
+            photo("d", 900.0, 500, Uncertain),
+        ];
+        assert_eq!(told(by_two), Some(1200.0));
+        let uncertain = vec![photo("a", 1500.0, 9, Uncertain), photo("b", 1920.0, 0, NotLocalized)];
+        assert_eq!(told(uncertain), Some(1500.0));
+        assert_eq!(told(vec![photo("a", 1500.0, 0, NotLocalized)]), None);
+        assert_eq!(told(vec![photo("k", 1111.0, 99, Localized)]), None);
+        assert!(with_estimated_cameras(&images, None).is_none());
+    }
 
     #[test]
     fn a_photo_that_its_set_places_elsewhere_is_no_longer_localized() {

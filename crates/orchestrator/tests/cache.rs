@@ -101,9 +101,9 @@ fn build_and_locate(folder: &Path, config: &Config) -> Vec<String> {
     };
     assert!(built.scene.main().is_some(), "the small town must be mapped for this test to say anything");
     let what = LocateJobs { scene: built.scene, config: config.clone(), seed: 7 };
-    let photos = read("queries/lane");
+    let mut photos = read("queries/lane");
     let target = photos.images.last().unwrap().name.clone();
-    locate(&session, &photos, &what, Mode::Both, "lane", &target).unwrap();
+    locate(&session, &mut photos, &what, Mode::Both, "lane", &target).unwrap();
     logged(&log, "finished")
 }
 

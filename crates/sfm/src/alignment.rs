@@ -26,8 +26,8 @@ use setloc_features::{
 use crate::{
     AlignedTrack, ImageId, Observation, Place, Reconstruction, Rigid,
     bundle::{
-        self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
-        RobustLoss,
+        self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, CameraPrior,
+        IntrinsicsFreedom, RobustLoss,
     },
     mapper::MIN_ADJUSTABLE_POINTS,
     solvers::tangent_basis,
@@ -487,7 +487,9 @@ impl<'a> Tracks<'a> {
         }
         for (camera, freedom) in problem.camera_freedom.iter_mut().enumerate() {
             if camera_fixed.get(camera) == Some(&false) && users[camera] >= 2 {
-                *freedom = IntrinsicsFreedom::LENS;
+                *freedom = IntrinsicsFreedom::FREE;
+                let usual = CameraPrior::of_usual_photo(camera as u32, &component.cameras[camera]);
+                problem.camera_priors.extend(usual);
             }
         }
         let points = component.points.iter();

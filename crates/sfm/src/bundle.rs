@@ -44,8 +44,8 @@ pub use length::LengthRatio;
 pub use levenberg_marquardt::Termination;
 pub use loss::RobustLoss;
 pub use problem::{
-    BundleBearing, BundleObservation, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
-    PositionPrior,
+    BundleBearing, BundleObservation, BundlePoint, BundlePose, BundleProblem, CameraPrior, IntrinsicsFreedom,
+    ParameterEstimate, PositionPrior,
 };
 
 /// S counts as singular when it has an eigenvalue below this, relative to the diagonal of JᵀJ.
@@ -115,7 +115,7 @@ pub struct BundleReport {
     pub observations: usize,
     /// Observations and priors that could not be used.
     pub ignored: usize,
-    /// Scalar residuals (two per observation, three per prior) minus scalar unknowns; a free gauge is not subtracted.
+    /// Scalar residuals (two per observation, three per measured position, one per parameter known beforehand) minus scalar unknowns; a free gauge is not subtracted.
     pub degrees_of_freedom: i64,
 }
 
@@ -143,12 +143,12 @@ impl BundleReport {
 pub fn solve(params: &BundleParams, problem: &mut BundleProblem) -> BundleReport {
     let loss = if params.loss.is_valid() { params.loss } else { RobustLoss::Trivial };
     let (mut model, layout) = Spherical::new(problem, loss);
-    let Layout { structure, point_of_index, ignored, priors } = layout;
+    let Layout { structure, point_of_index, ignored, prior_residuals } = layout;
     let observations = structure.links.len();
     let budget = Budget::new(params.linear_solver, observations);
     let mut equations = NormalEquations::<POSE_DIM>::new(structure, &budget);
     let unknowns = equations.unknowns();
-    let degrees_of_freedom = (2 * observations + 3 * priors) as i64 - unknowns as i64;
+    let degrees_of_freedom = (2 * observations + prior_residuals) as i64 - unknowns as i64;
     let outcome = if unknowns == 0 {
         Outcome::nothing_to_do(equations.linearize(&model, 0.0))
     } else {

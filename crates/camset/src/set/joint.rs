@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use rayon::prelude::*;
-use setloc_features::{Camera, Keypoint};
+use setloc_features::{Calibration, Camera, Keypoint};
 use setloc_sfm::{BaselineLength, ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
 
 use super::called;
@@ -605,7 +605,7 @@ impl Component<'_> {
     fn fixed_cameras(&self) -> Vec<bool> {
         let mut fixed = vec![true; self.model.cameras.len()];
         for (slot, &photo) in self.members.iter().enumerate() {
-            fixed[self.camera_of(slot)] &= self.photos[photo].camera_fixed;
+            fixed[self.camera_of(slot)] &= self.photos[photo].calibration == Calibration::Known;
         }
         fixed
     }

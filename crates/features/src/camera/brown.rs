@@ -141,9 +141,16 @@ fn invert_radius(distorted: f64, k1: f64, k2: f64) -> Option<f64> {
         }
     }
     // Far out the highest power is all there is; Newton from the distorted radius would need a step for each fifth.
-    let far = if k2 > 0.0 { (distorted / k2).powf(0.2) } else { (distorted / k1.max(0.0)).cbrt() };
+    let squared = distorted * distorted;
+    let far = if k2 > 0.0 && k2 * squared * squared > 1.0 {
+        (distorted / k2).powf(0.2)
+    } else if k2 <= 0.0 && k1 * squared > 1.0 {
+        (distorted / k1).cbrt()
+    } else {
+        distorted
+    };
     let slope_of = |r: f64| radial_slope(r * r, k1, k2);
-    Some(invert_growing(distorted, radius_of, slope_of, [0.0, high], distorted.min(high).min(far)))
+    Some(invert_growing(distorted, radius_of, slope_of, [0.0, high], far.min(high)))
 }
 
 fn invert(point: &Vector2<f64>, terms: &[f64; 4]) -> Option<Vector2<f64>> {

@@ -11,7 +11,7 @@ pub(super) const MIN_SLOPE: f64 = 1e-3;
 /// Focal lengths, principal point and distortion terms that all single-centre lens models share.
 pub(super) struct Intrinsics {
     pub focal: Vector2<f64>,
-    center: Vector2<f64>,
+    pub center: Vector2<f64>,
     pub distortion: [f64; 4],
 }
 

@@ -32,6 +32,26 @@ pub struct Camera {
     pub params: Vec<f64>,
 }
 
+/// How well the intrinsics of a camera are known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Calibration {
+    /// They are known and stay as they are.
+    Known,
+    /// They were estimated from photos of this camera in a scene: good enough for a model of these photos, and still
+    /// estimated wherever a scene shows more.
+    Estimated,
+    /// They are a guess: the focal length may be half or twice as long.
+    Guessed,
+}
+
+impl Calibration {
+    /// Whether models of photos among themselves take them as they are.
+    pub fn is_settled(self) -> bool {
+        self != Self::Guessed
+    }
+}
+
 /// A pixel and how it moves with the direction and the intrinsic parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProjectJacobian {
@@ -56,7 +76,7 @@ pub struct UnprojectJacobian {
 
 impl UnprojectJacobian {
     /// The angle in radians that one pixel spans, the root mean square over the two axes.
-    fn pixel_angle(&self) -> f64 {
+    pub fn pixel_angle(&self) -> f64 {
         (self.d_pixel.norm_squared() / 2.0).sqrt()
     }
 }
@@ -68,13 +88,22 @@ impl Camera {
         Self { model: CameraModel::Equirectangular, width, height, params }
     }
 
-    /// A photo of which only a guess of the focal length is known: `SIMPLE_RADIAL`, centred, no distortion yet.
+    /// A photo of which only a guess of the focal length is known: `RADIAL`, centred, no distortion yet.
     ///
-    /// A guessed camera is going to be refined, and real lenses distort; a single radial term costs one unknown
-    /// and takes most of the distortion of phones and action cameras.
+    /// A guessed camera is going to be refined, and real lenses distort; two radial terms take nearly all of the
+    /// distortion of phones and action cameras.
     pub fn from_focal_guess(width: u32, height: u32, focal_px: f64) -> Self {
-        let params = vec![focal_px, f64::from(width) / 2.0, f64::from(height) / 2.0, 0.0];
-        Self { model: CameraModel::SimpleRadial, width, height, params }
+        let params = vec![focal_px, f64::from(width) / 2.0, f64::from(height) / 2.0, 0.0, 0.0];
+        Self { model: CameraModel::Radial, width, height, params }
+    }
+
+    /// The same camera as `OPENCV`, with two focal lengths and tangential distortion; only of radial models.
+    #[must_use]
+    pub fn with_tangential_distortion(self) -> Self {
+        let Some((Lens::Brown, k)) = self.lens() else { return self };
+        let mut params = vec![k.focal.x, k.focal.y, k.center.x, k.center.y];
+        params.extend(k.distortion);
+        Self { model: CameraModel::Opencv, params, ..self }
     }
 
     /// Checks parameter count, finiteness and ranges.
@@ -191,6 +220,18 @@ impl Camera {
             return equirectangular::pixel_angle(&self.params, pixel);
         }
         self.unproject_with_jacobian(pixel).map(|ray| ray.pixel_angle())
+    }
+
+    /// [`Camera::pixel_angle`] where a direction in the camera frame (of unit length) is seen, which inverts no
+    /// distortion.
+    pub fn pixel_angle_towards(&self, direction: &Vector3<f64>) -> Option<f64> {
+        let Some((lens, k)) = self.lens() else { return self.pixel_angle(&self.project(direction)?) };
+        let by_direction = lens.distort_with_jacobian(direction, &k.distortion)?.d_direction;
+        let (x, y) = (by_direction.row(0) * k.focal.x, by_direction.row(1) * k.focal.y);
+        // Its pseudo-inverse P⁺ is ∂bearing/∂pixel, and ‖P⁺‖² the trace of (P Pᵀ)⁻¹.
+        let (xx, xy, yy) = (x.dot(&x), x.dot(&y), y.dot(&y));
+        let squared = (xx + yy) / (2.0 * (xx * yy - xy * xy));
+        (squared > 0.0 && squared.is_finite()).then(|| squared.sqrt())
     }
 
     /// Whether a pixel lies in the image.

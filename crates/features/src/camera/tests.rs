@@ -131,6 +131,22 @@ fn paper_rectilinear_is_no_pinhole_off_the_axes() {
 }
 
 #[test]
+fn tangential_distortion_is_added_to_what_lenses_of_this_kind_have() {
+    for camera in cameras() {
+        let opencv = camera.clone().with_tangential_distortion();
+        if opencv == camera {
+            let kept = [CameraModel::Opencv, CameraModel::Equirectangular];
+            let fisheye = camera.model.name().contains("FISHEYE");
+            assert!(fisheye || kept.contains(&camera.model) || camera.model == CameraModel::PaperRectilinear);
+            continue;
+        }
+        assert!(opencv.model == CameraModel::Opencv && opencv.validate().is_ok());
+        let direction = Vector3::new(0.2, -0.3, 1.0);
+        assert!((opencv.project(&direction).unwrap() - camera.project(&direction).unwrap()).norm() < 1e-10);
+    }
+}
+
+#[test]
 fn jacobians_agree_with_their_numeric_twins() {
     for camera in cameras() {
         let (w, h) = (f64::from(camera.width), f64::from(camera.height));
@@ -141,6 +157,8 @@ fn jacobians_agree_with_their_numeric_twins() {
             let (bearing, pixel_angle) = camera.ray(&pixel).unwrap();
             assert!(angle(&bearing, &analytic.bearing) < 1e-13);
             assert_eq!(pixel_angle, camera.pixel_angle(&pixel).unwrap());
+            let towards = camera.pixel_angle_towards(&bearing).unwrap();
+            assert!((towards / pixel_angle - 1.0).abs() < 1e-9, "{camera:?} {towards} {pixel_angle}");
             check_unproject(&camera, &pixel, &analytic.d_pixel, &analytic.d_params);
 
             let direction = analytic.bearing * 2.5;

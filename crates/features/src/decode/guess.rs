@@ -48,7 +48,7 @@ impl std::fmt::Display for CameraSource {
 /// The most likely camera of an image that nobody described, and why.
 ///
 /// In this order: GPano metadata or a 2:1 image without a photo's focal length give `EQUIRECTANGULAR`; EXIF's 35 mm
-/// focal length, then focal length and sensor resolution, then 1.2 times the longer side give `SIMPLE_RADIAL`.
+/// focal length, then focal length and sensor resolution, then 1.2 times the longer side give `RADIAL`.
 /// Senseless entries are passed over, so there is always an answer.
 pub fn guess_camera(info: &ImageInfo) -> (Camera, CameraSource) {
     let (width, height) = (f64::from(info.width), f64::from(info.height));

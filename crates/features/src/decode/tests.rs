@@ -219,7 +219,7 @@ fn exif_focal_length_and_position_are_read() {
     assert!((position.lat_deg + 33.51).abs() < 1e-9 && (position.lon_deg - 151.2).abs() < 1e-9);
     assert_eq!(position.alt_m, Some(-12.5));
     let (camera, source) = guess_camera(&ImageInfo { width: 4000, height: 3000, metadata });
-    assert_eq!((camera.model, source), (CameraModel::SimpleRadial, CameraSource::ExifFocal35mm));
+    assert_eq!((camera.model, source), (CameraModel::Radial, CameraSource::ExifFocal35mm));
     assert!((camera.params[0] - 26.0 / 43.2666 * 5000.0).abs() < 0.01);
     let zero = ImageMetadata::read(&with_app1(&jpeg, &exif(&[], &[(0xA405, 3, &[0])], &[])));
     assert_eq!(zero.focal_35mm, None);

@@ -177,7 +177,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         // A set of nothing readable leaves the others as they are.
         let read = list_below(root, &set)
             .and_then(|files| Ok((ImageFolder::read(&files, &cameras, &GeoSource::None, None)?, files)));
-        let (photos, files) = match read {
+        let (mut photos, files) = match read {
             Ok(read) => read,
             Err(error) => {
                 skipped_sets.insert(name, format!("{error:#}"));
@@ -190,7 +190,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
             config: options.config.clone(),
             seed: options.seed,
         };
-        let located = locate(session, &photos, &what, Mode::Both, &run_name(&set), &target)?;
+        let located = locate(session, &mut photos, &what, Mode::Both, &run_name(&set), &target)?;
         if located.skipped.len() == files.len() {
             let reasons: Vec<String> =
                 located.skipped.iter().map(|photo| format!("{}: {}", photo.name, photo.reason)).collect();

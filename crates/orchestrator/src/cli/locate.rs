@@ -44,7 +44,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     let files = list_images(&args.photos)?;
     let target = find_target(args.target.as_deref(), &files)?;
     let cameras = args.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default();
-    let photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
+    let mut photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
     remark(&photos);
     // Results of photos are kept beside the scene, where those of its images are.
     let session = args.run.session(&args.scene, Some(&args.output))?;
@@ -55,7 +55,8 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
         Mode::Auto if args.grow.is_some() => Mode::Both,
         mode => mode,
     };
-    let located = locate(&session, &photos, &what, mode, &name, &target)?;
+    let located = locate(&session, &mut photos, &what, mode, &name, &target)?;
+    photos.estimated_cameras().iter().for_each(|line| print::note(line));
     write_results(&args.output, &located, &what.scene, &target, &session)?;
     warn_skipped(&located.skipped);
     warn_of_scene(&what.scene.warnings);

@@ -3,7 +3,7 @@ use std::path::{Component, Path, PathBuf};
 
 use anyhow::{Context, Result};
 use rayon::prelude::*;
-use setloc_features::{Camera, CameraSource, GeoPosition};
+use setloc_features::{Calibration, Camera, CameraSource, GeoPosition};
 
 use super::remarks::{Given, warnings_of};
 use super::{CameraBook, GeoBook, GeoSource};
@@ -23,10 +23,10 @@ pub struct SourceImage {
     pub path: PathBuf,
     /// Hash of the file.
     pub hash: ContentHash,
-    /// Its camera, a guess unless `camera_fixed`.
+    /// Its camera.
     pub camera: Camera,
-    /// Whether the intrinsics are known and stay.
-    pub camera_fixed: bool,
+    /// How well the camera's intrinsics are known.
+    pub calibration: Calibration,
     /// Where the camera comes from.
     pub camera_origin: CameraOrigin,
     /// Measured position.
@@ -42,6 +42,8 @@ pub enum CameraOrigin {
     Listed,
     /// From the image itself, or from nothing.
     Guessed(CameraSource),
+    /// From the set's localization.
+    Estimated,
 }
 
 /// An image that cannot be used, and why.
@@ -224,12 +226,12 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
     let info = stages::probe(&bytes, &stages::DecodeLimits::default()).context("not a readable image")?;
     let known =
         cameras.find(name, path).filter(|camera| (camera.width, camera.height) == (info.width, info.height));
-    let (camera, camera_fixed, camera_origin) = if let Some(camera) = known {
-        (camera.clone(), true, CameraOrigin::Listed)
+    let (camera, calibration, camera_origin) = if let Some(camera) = known {
+        (camera.clone(), Calibration::Known, CameraOrigin::Listed)
     } else {
         let (camera, source) = stages::guess_camera(&info);
-        let fixed = camera.is_panoramic();
-        (camera, fixed, CameraOrigin::Guessed(source))
+        let calibration = if camera.is_panoramic() { Calibration::Known } else { Calibration::Guessed };
+        (camera, calibration, CameraOrigin::Guessed(source))
     };
     let exif = (*geo == GeoSource::Exif).then_some(info.metadata.gps).flatten();
     let position = exif.filter(GeoPosition::is_valid);
@@ -239,7 +241,7 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
         path: path.to_owned(),
         hash,
         camera,
-        camera_fixed,
+        calibration,
         camera_origin,
         position,
         mask: None,
@@ -318,7 +320,9 @@ mod tests {
             ImageFolder::read(&list_images(&days).unwrap(), &book, &GeoSource::Table(table), None).unwrap();
         let latitudes: Vec<f64> = read.images.iter().map(|image| image.position.unwrap().lat_deg).collect();
         assert_eq!(latitudes, [1.0, 2.0, 3.0]);
-        assert!(read.images.iter().all(|image| image.camera == camera && image.camera_fixed));
+        assert!(
+            read.images.iter().all(|image| image.camera == camera && image.calibration == Calibration::Known)
+        );
         assert!(read.warnings.is_empty(), "{:?}", read.warnings);
     }
 

@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use setloc_features::CameraSource;
+use setloc_features::{Camera, CameraSource};
 
 use super::{CameraBook, CameraOrigin, GeoBook, GeoSource, ImageFolder, SourceImage};
 use crate::fingerprint::ContentHash;
@@ -23,6 +23,22 @@ impl ImageFolder {
         let parts: Vec<String> = counts.into_iter().map(|(origin, count)| in_words(origin, count)).collect();
         (!parts.is_empty()).then(|| format!("cameras: {}", parts.join(", ")))
     }
+
+    /// What the set has told of cameras that were a guess, a line each.
+    pub fn estimated_cameras(&self) -> Vec<String> {
+        let mut cameras: Vec<(&Camera, Vec<String>)> = Vec::new();
+        for image in self.images.iter().filter(|image| image.camera_origin == CameraOrigin::Estimated) {
+            match cameras.iter_mut().find(|(camera, _)| **camera == image.camera) {
+                Some((_, photos)) => photos.push(image.name.clone()),
+                None => cameras.push((&image.camera, vec![image.name.clone()])),
+            }
+        }
+        let line = |(camera, photos): (&Camera, Vec<String>)| {
+            let focal = camera.focal_length();
+            format!("focal length estimated with the scene: {focal:.1} px: {}", some_of(&photos, "photos"))
+        };
+        cameras.into_iter().map(line).collect()
+    }
 }
 
 fn in_words(origin: CameraOrigin, count: usize) -> String {
@@ -39,6 +55,7 @@ fn in_words(origin: CameraOrigin, count: usize) -> String {
         CameraOrigin::Guessed(CameraSource::ExifFocalPlane) => {
             format!("{} by EXIF's focal length and sensor resolution", counted("photo"))
         }
+        CameraOrigin::Estimated => format!("{} by the scene", counted("photo")),
         CameraOrigin::Guessed(source) => format!("{}: {source}", counted("image")),
     }
 }

@@ -47,7 +47,7 @@ pub fn add_grown(
     what: &LocateJobs,
 ) -> Result<JobId> {
     let Config { camset, growth, .. } = &what.config;
-    let listed: Vec<_> = photos.iter().map(|p| json!([p.name, p.hash, p.camera, p.camera_fixed])).collect();
+    let listed: Vec<_> = photos.iter().map(|p| json!([p.name, p.hash, p.camera, p.calibration])).collect();
     let known = &what.scene.grown_from;
     let params =
         json!({ "growth": growth, "camset": camset, "alone": alone, "photos": listed, "known": known });

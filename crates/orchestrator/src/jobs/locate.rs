@@ -58,7 +58,7 @@ pub fn add_set(
     let source = ModelSource { images: photos, positions: &positions, pairs: &pairs };
     let model = add_model(graph, ModelKind::Local, name, source, &what.config, what.seed)?;
     let single = add_singles(graph, photos, &model.features, what);
-    let listed: Vec<_> = photos.iter().map(|p| json!([p.name, p.camera, p.camera_fixed])).collect();
+    let listed: Vec<_> = photos.iter().map(|p| json!([p.name, p.camera, p.calibration])).collect();
     let Config { camset, matching, two_view, .. } = &what.config;
     let params = json!({
         "camset": camset, "matching": matching, "two_view": two_view, "seed": what.seed, "photos": listed
@@ -125,7 +125,7 @@ pub fn add_singles(
 }
 
 fn add_single(graph: &mut JobGraph<'_>, photo: &SourceImage, features: JobId, what: &LocateJobs) -> JobId {
-    let camera = json!([photo.name, photo.camera, photo.camera_fixed]);
+    let camera = json!([photo.name, photo.camera, photo.calibration]);
     let params = json!({ "single": what.config.single, "seed": what.seed, "photo": camera });
     let (owned, what_here) = (photo.clone(), what.clone());
     let work = move |inputs: &Inputs<'_, '_>| {
@@ -155,7 +155,7 @@ pub(super) fn single_role(photo: usize) -> String {
 }
 
 pub(super) fn query<'a>(photo: &'a SourceImage, features: &'a ImageFeatures) -> QueryPhoto<'a> {
-    QueryPhoto { name: &photo.name, camera: &photo.camera, camera_fixed: photo.camera_fixed, features }
+    QueryPhoto { name: &photo.name, camera: &photo.camera, calibration: photo.calibration, features }
 }
 
 /// Stands for the largest component where there is none.

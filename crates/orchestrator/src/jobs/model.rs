@@ -153,11 +153,16 @@ fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, features: &stages
     if let Some((_, hash)) = &mask {
         external.insert("mask".to_owned(), *hash);
     }
+    // A photo's features do not depend on its intrinsics, which may be estimated later.
+    let camera = if image.camera.is_panoramic() {
+        image.camera.clone()
+    } else {
+        Camera::from_focal_guess(image.camera.width, image.camera.height, image.camera.width.into())
+    };
     // Decoded pixels and six layers of the doubled image in floats, half of them with their smaller octaves.
     let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 128;
-    let params = json!({ "features": features, "camera": image.camera });
-    let (path, hash, camera, features) =
-        (image.path.clone(), image.hash, image.camera.clone(), features.clone());
+    let params = json!({ "features": features, "camera": camera });
+    let (path, hash, features) = (image.path.clone(), image.hash, features.clone());
     let work = move |_: &Inputs<'_, '_>| {
         let bytes = read_unchanged(&path, hash)?;
         let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
@@ -252,11 +257,12 @@ struct SharedCameras {
 fn share_cameras(images: &[SourceImage]) -> SharedCameras {
     let mut shared = SharedCameras { cameras: Vec::new(), fixed: Vec::new(), of_image: Vec::new() };
     for image in images {
-        let same =
-            |at: &usize| shared.cameras[*at] == image.camera && shared.fixed[*at] == image.camera_fixed;
+        let same = |at: &usize| {
+            shared.cameras[*at] == image.camera && shared.fixed[*at] == image.calibration.is_settled()
+        };
         let at = (0..shared.cameras.len()).find(same).unwrap_or_else(|| {
             shared.cameras.push(image.camera.clone());
-            shared.fixed.push(image.camera_fixed);
+            shared.fixed.push(image.calibration.is_settled());
             shared.cameras.len() - 1
         });
         shared.of_image.push(at);

@@ -259,7 +259,7 @@ fn middle(values: impl Iterator<Item = f64>) -> Option<f64> {
 mod tests {
     use std::path::PathBuf;
 
-    use setloc_features::Camera;
+    use setloc_features::{Calibration, Camera};
 
     use super::*;
     use crate::dataset::CameraOrigin;
@@ -271,7 +271,7 @@ mod tests {
             path: PathBuf::new(),
             hash: ContentHash::of(b""),
             camera: Camera::equirectangular(20, 10),
-            camera_fixed: true,
+            calibration: Calibration::Known,
             camera_origin: CameraOrigin::Listed,
             position: Some(GeoPosition { lat_deg, lon_deg, alt_m }),
             mask: None,

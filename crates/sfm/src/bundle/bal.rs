@@ -204,7 +204,7 @@ impl Model<CAMERA_DIM> for BalModel {
         0.0
     }
 
-    fn block_terms_cost(&self) -> f64 {
+    fn prior_cost(&self) -> f64 {
         0.0
     }
 

@@ -56,6 +56,9 @@ pub(super) struct Linearized<const D: usize> {
 /// Takes block, JᵀJ and Jᵀr of a term of that block alone.
 pub(super) type BlockTerm<'a, const D: usize> = &'a mut dyn FnMut(usize, &[[f64; D]; D], &[f64; D]);
 
+/// Takes extra block and row of it, and of a term of that block alone Jᵀr and the values of JᵀJ in that row, by column.
+pub(super) type ExtraTerm<'a> = &'a mut dyn FnMut(usize, usize, f64, &mut dyn Iterator<Item = (usize, f64)>);
+
 /// A bundle problem: state, candidate state, residuals.
 pub(super) trait Model<const D: usize>: Sync {
     /// Loss of all observations.
@@ -66,8 +69,12 @@ pub(super) trait Model<const D: usize>: Sync {
     fn squared_residual(&self, observation: usize, point: &Vector3<f64>) -> f64;
     /// Calls `add(block, h, g)` with the (weighted) JᵀJ and Jᵀr of terms of a single block; returns their cost.
     fn linearize_block_terms(&self, add: BlockTerm<'_, D>) -> f64;
-    /// Cost of these terms at the candidate state.
-    fn block_terms_cost(&self) -> f64;
+    /// Calls `add` with terms of single further blocks, row by row; returns their cost.
+    fn linearize_extra_terms(&self, _: ExtraTerm<'_>) -> f64 {
+        0.0
+    }
+    /// Cost of the terms of single blocks at the candidate state.
+    fn prior_cost(&self) -> f64;
     /// Sets the candidate to current ⊞ step (all blocks, then all extra blocks); false when that is no valid state.
     fn propose(&mut self, step: &[f64]) -> bool;
     /// Makes the candidate the current state.
@@ -418,6 +425,14 @@ impl<const D: usize> NormalEquations<D> {
             add(&mut base[block * D * D..(block + 1) * D * D], hessian.as_flattened());
             add(&mut gradient[block * D..(block + 1) * D], block_gradient);
         });
+        let (pattern, block_count) = (&self.pattern, self.block_count);
+        cost += model.linearize_extra_terms(&mut |extra, row, first, second| {
+            let block = block_count + extra;
+            gradient[pattern.start(block) + row] += first;
+            for (column, value) in second {
+                base[pattern.offset(block, block) + column * pattern.dim(block) + row] += value;
+            }
+        });
         cost
     }
 
@@ -539,7 +554,7 @@ impl<const D: usize> NormalEquations<D> {
             sums.squared_norm += chunk.sums.squared_norm;
         }
         let cost = if is_valid {
-            self.chunks.iter().map(|chunk| chunk.cost).sum::<f64>() + model.block_terms_cost()
+            self.chunks.iter().map(|chunk| chunk.cost).sum::<f64>() + model.prior_cost()
         } else {
             f64::INFINITY
         };
@@ -641,7 +656,7 @@ mod tests {
             add(1, &[[2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 4.0]], &[0.5, 0.6, 0.7]);
             0.0
         }
-        fn block_terms_cost(&self) -> f64 {
+        fn prior_cost(&self) -> f64 {
             0.0
         }
         fn propose(&mut self, _: &[f64]) -> bool {

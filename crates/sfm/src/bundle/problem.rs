@@ -1,6 +1,6 @@
 use nalgebra::{Vector2, Vector3};
 use serde::{Deserialize, Serialize};
-use setloc_features::Camera;
+use setloc_features::{Camera, ParamRole};
 
 use super::RobustLoss;
 use crate::Rigid;
@@ -22,8 +22,8 @@ pub struct IntrinsicsFreedom {
 impl IntrinsicsFreedom {
     /// All intrinsics are known.
     pub const FIXED: Self = Self { focal: false, principal_point: false, distortion: false };
-    /// Focal lengths and distortion are estimated, the principal point is known.
-    pub const LENS: Self = Self { focal: true, principal_point: false, distortion: true };
+    /// All intrinsics are estimated.
+    pub const FREE: Self = Self { focal: true, principal_point: true, distortion: true };
 }
 
 /// One image of a bundle problem.
@@ -85,6 +85,61 @@ pub struct PositionPrior {
     pub loss: RobustLoss,
 }
 
+/// A value and its standard deviation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ParameterEstimate {
+    /// The value.
+    pub value: f64,
+    /// Its standard deviation; infinite where nothing is known.
+    pub sigma: f64,
+}
+
+/// What is known of a camera's intrinsics before anything is seen; parameters that are not estimated have no effect.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CameraPrior {
+    /// Index into [`BundleProblem::cameras`].
+    pub camera: u32,
+    /// One a parameter of the camera, in its order.
+    pub parameters: Vec<ParameterEstimate>,
+    /// Standard deviation of the ratio of a camera's two focal lengths from 1.
+    pub aspect_sigma: f64,
+}
+
+impl CameraPrior {
+    /// What holds for the usual photo, as standard deviations: the principal point lies within 0.5 % of the longer side of
+    /// the image's centre, the first radial coefficient is within 0.2, further ones within 0.05, tangential ones within
+    /// 0.001, and pixels are square to 0.1 %; nothing is known of the focal length. `None` for panoramas, which have
+    /// nothing to estimate.
+    ///
+    /// Calibrations of phones, action and system cameras put the principal point 0.1–1 % off the centre.
+    pub fn of_usual_photo(index: u32, camera: &Camera) -> Option<Self> {
+        if camera.is_panoramic() {
+            return None;
+        }
+        let (width, height) = (f64::from(camera.width), f64::from(camera.height));
+        let known = |(role, name): (&ParamRole, &&str)| {
+            let (value, sigma) = match (role, *name) {
+                (ParamRole::PrincipalPoint, "cx") => (width / 2.0, 0.005 * width.max(height)),
+                (ParamRole::PrincipalPoint, _) => (height / 2.0, 0.005 * width.max(height)),
+                (ParamRole::Distortion, "k" | "k1") => (0.0, 0.2),
+                (ParamRole::Distortion, "p1" | "p2") => (0.0, 0.001),
+                (ParamRole::Distortion, _) => (0.0, 0.05),
+                _ => (0.0, f64::INFINITY),
+            };
+            ParameterEstimate { value, sigma }
+        };
+        let parameters = camera.param_roles().iter().zip(camera.model.param_names()).map(known).collect();
+        Some(Self { camera: index, parameters, aspect_sigma: 0.001 })
+    }
+
+    /// Whether it is one of this camera, in numbers that can be weighed.
+    pub(super) fn fits(&self, camera: Option<&Camera>) -> bool {
+        camera.is_some_and(|camera| camera.params.len() == self.parameters.len())
+            && self.parameters.iter().all(|known| known.value.is_finite() && known.sigma > 0.0)
+            && self.aspect_sigma > 0.0
+    }
+}
+
 /// Cameras, poses, points and what ties them together.
 ///
 /// Observations, bearings and priors that cannot be used (indices out of range, values that are not finite, pixels outside the
@@ -105,4 +160,6 @@ pub struct BundleProblem {
     pub bearings: Vec<BundleBearing>,
     /// Measured camera centres.
     pub position_priors: Vec<PositionPrior>,
+    /// What is known of cameras beforehand; at most one a camera.
+    pub camera_priors: Vec<CameraPrior>,
 }

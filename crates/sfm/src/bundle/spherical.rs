@@ -1,13 +1,15 @@
 //! A [`BundleProblem`] as a [`Model`]: angular residuals, poses of 6 scalars, intrinsics as extra blocks.
 
-use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Matrix3, UnitQuaternion, Vector2, Vector3};
 use rayon::prelude::*;
 use setloc_features::{Camera, CameraModel, MAX_CAMERA_PARAMS};
 
-use super::normal_equations::{BlockTerm, Linearized, Link, Model, Structure};
+use super::normal_equations::{BlockTerm, ExtraTerm, Linearized, Link, Model, Structure};
 use super::pattern::NONE;
 use super::residual::{angular, angular_squared, bearing_change, point_row, rotation_row};
-use super::{BundleObservation, BundleProblem, IntrinsicsFreedom, RobustLoss};
+use super::{
+    BundleObservation, BundleProblem, CameraPrior, IntrinsicsFreedom, ParameterEstimate, RobustLoss,
+};
 use crate::Rigid;
 
 /// Scalars of a pose: rotation (right perturbation, camera frame), then translation (world frame).
@@ -60,13 +62,99 @@ struct PixelRay {
     noise_px: f64,
 }
 
-/// One usable prior on a free pose.
+/// A usable prior on a free pose.
 #[derive(Debug, Clone, Copy)]
 struct Prior {
     pose: u32,
     position: Vector3<f64>,
     inverse_sigma: f64,
     loss: RobustLoss,
+}
+
+/// A camera of which parameters are estimated.
+#[derive(Debug, Clone)]
+struct FreeIntrinsics {
+    camera: u32,
+    /// Ascending.
+    parameters: Vec<usize>,
+    /// The current camera with each of them moved a little.
+    moved: Vec<MovedCamera>,
+}
+
+impl FreeIntrinsics {
+    fn new(index: usize, camera: &Camera, parameters: Vec<usize>) -> Self {
+        let moved = parameters.iter().map(|&parameter| MovedCamera::new(camera, parameter)).collect();
+        Self { camera: index as u32, parameters, moved }
+    }
+
+    fn refresh(&mut self, camera: &Camera) {
+        let Self { parameters, moved, .. } = self;
+        *moved = parameters.iter().map(|&parameter| MovedCamera::new(camera, parameter)).collect();
+    }
+}
+
+/// A camera one of whose parameters is moved by `by`.
+#[derive(Debug, Clone)]
+struct MovedCamera {
+    camera: Camera,
+    by: f64,
+}
+
+impl MovedCamera {
+    fn new(camera: &Camera, parameter: usize) -> Self {
+        let mut camera = camera.clone();
+        let by = 1e-6 * camera.params[parameter].abs().max(1.0);
+        camera.params[parameter] += by;
+        Self { camera, by }
+    }
+
+    /// ∂ ln(pixel angle)/∂parameter of a pixel whose bearing moves by `d_bearing`; without it a focal length far off does
+    /// not find its way.
+    fn d_log_pixel_angle(&self, bearing: &Vector3<f64>, d_bearing: &Vector3<f64>, pixel_angle: f64) -> f64 {
+        let moved = self.camera.pixel_angle_towards(&(bearing + d_bearing * self.by));
+        moved.map_or(0.0, |after| (after / pixel_angle).ln() / self.by)
+    }
+}
+
+/// What is known beforehand of free parameters of a camera: Σ cᵢ pᵢ = v.
+#[derive(Debug, Clone)]
+struct ParameterPrior {
+    camera: usize,
+    extra: usize,
+    /// Place among the free parameters, the parameter, and its coefficient over σ.
+    terms: Vec<(usize, usize, f64)>,
+    /// v/σ.
+    value: f64,
+}
+
+impl ParameterPrior {
+    /// (Σ cᵢ pᵢ − v)/σ.
+    fn residual(&self, cameras: &[Camera]) -> f64 {
+        let params = &cameras[self.camera].params;
+        self.terms.iter().map(|&(_, parameter, weight)| params[parameter] * weight).sum::<f64>() - self.value
+    }
+
+    /// Those of a camera whose free parameters are an extra block.
+    fn of_camera(prior: &CameraPrior, camera: &Camera, extra: usize, free: &[usize]) -> Vec<Self> {
+        let index = prior.camera as usize;
+        let of_one = |(at, &parameter): (usize, &usize)| {
+            let ParameterEstimate { value, sigma } = prior.parameters[parameter];
+            let terms = vec![(at, parameter, 1.0 / sigma)];
+            sigma.is_finite().then(|| Self { camera: index, extra, terms, value: value / sigma })
+        };
+        let mut priors: Vec<Self> = free.iter().enumerate().filter_map(of_one).collect();
+        let focal = focal_parameters(camera.model);
+        if focal.len() == 2 && free.starts_with(&[0, 1]) && prior.aspect_sigma.is_finite() {
+            let weight = 1.0 / (prior.aspect_sigma * camera.focal_length());
+            priors.push(Self {
+                camera: index,
+                extra,
+                terms: vec![(0, 0, weight), (1, 1, -weight)],
+                value: 0.0,
+            });
+        }
+        priors
+    }
 }
 
 /// The problem, compacted to what is used, with current and candidate state of the camera side.
@@ -82,9 +170,10 @@ pub(super) struct Spherical {
     block_of_pose: Vec<u32>,
     cameras: Vec<Camera>,
     candidate_cameras: Vec<Camera>,
-    /// Camera and its free parameters, per extra block.
-    intrinsics: Vec<(u32, Vec<usize>)>,
+    /// Per extra block.
+    intrinsics: Vec<FreeIntrinsics>,
     priors: Vec<Prior>,
+    parameter_priors: Vec<ParameterPrior>,
 }
 
 /// How a problem maps to unknowns.
@@ -93,8 +182,8 @@ pub(super) struct Layout {
     /// Index in the problem of each compacted point.
     pub point_of_index: Vec<u32>,
     pub ignored: usize,
-    /// Priors used and weighed, of free poses.
-    pub priors: usize,
+    /// Scalar residuals of the priors that are used.
+    pub prior_residuals: usize,
 }
 
 impl Prior {
@@ -219,7 +308,21 @@ impl Spherical {
             let parameters = free_parameters(camera, freedom);
             if !parameters.is_empty() {
                 extra_of_camera[index] = intrinsics.len() as u32;
-                intrinsics.push((index as u32, parameters));
+                intrinsics.push(FreeIntrinsics::new(index, camera, parameters));
+            }
+        }
+
+        let mut parameter_priors = Vec::new();
+        for prior in &problem.camera_priors {
+            let camera = prior.camera as usize;
+            if !prior.fits(problem.cameras.get(camera)) {
+                ignored += 1;
+                continue;
+            }
+            let extra = extra_of_camera[camera] as usize;
+            if let Some(FreeIntrinsics { parameters, .. }) = intrinsics.get(extra) {
+                let camera = &problem.cameras[camera];
+                parameter_priors.extend(ParameterPrior::of_camera(prior, camera, extra, parameters));
             }
         }
 
@@ -250,9 +353,10 @@ impl Spherical {
             points,
             free,
             block_count: pose_of_block.len(),
-            extra_dims: intrinsics.iter().map(|(_, parameters)| parameters.len()).collect(),
+            extra_dims: intrinsics.iter().map(|free| free.parameters.len()).collect(),
         };
-        let layout = Layout { structure, point_of_index, ignored, priors: priors.len() };
+        let prior_residuals = 3 * priors.len() + parameter_priors.len();
+        let layout = Layout { structure, point_of_index, ignored, prior_residuals };
         let model = Self {
             loss,
             rays,
@@ -265,6 +369,7 @@ impl Spherical {
             cameras: problem.cameras.clone(),
             intrinsics,
             priors,
+            parameter_priors,
         };
         (model, layout)
     }
@@ -279,8 +384,8 @@ impl Spherical {
         for &pose in &self.pose_of_block {
             problem.poses[pose as usize].world_from_camera = self.poses[pose as usize].world_from_camera;
         }
-        for (camera, _) in &self.intrinsics {
-            problem.cameras[*camera as usize].clone_from(&self.cameras[*camera as usize]);
+        for &FreeIntrinsics { camera, .. } in &self.intrinsics {
+            problem.cameras[camera as usize].clone_from(&self.cameras[camera as usize]);
         }
     }
 }
@@ -304,11 +409,12 @@ impl Model<POSE_DIM> for Spherical {
         let mut jacobian = None;
         if link.extra != NONE
             && let Some(PixelRay { camera, pixel, noise_px }) = &self.pixel_rays[observation]
-            && let Some(of_camera) = unproject_with_jacobian(&self.cameras[*camera as usize], pixel)
+            && let Some(of_camera) = self.cameras[*camera as usize].unproject_with_jacobian(pixel)
         {
             bearing = of_camera.bearing;
-            weight = 1.0 / (of_camera.pixel_angle * noise_px);
-            jacobian = Some(of_camera);
+            let pixel_angle = of_camera.pixel_angle();
+            weight = 1.0 / (pixel_angle * noise_px);
+            jacobian = Some((of_camera, pixel_angle));
         }
         let x = pose.camera_point(point);
         let angular = angular(&bearing, &x);
@@ -324,11 +430,12 @@ impl Model<POSE_DIM> for Spherical {
                     [by_rotation.x, by_rotation.y, by_rotation.z, -by_point.x, -by_point.y, -by_point.z];
             }
         }
-        if let Some(jacobian) = jacobian {
-            for (k, &parameter) in self.intrinsics[link.extra as usize].1.iter().enumerate() {
+        if let Some((jacobian, pixel_angle)) = jacobian {
+            let FreeIntrinsics { parameters, moved, .. } = &self.intrinsics[link.extra as usize];
+            for (k, (&parameter, moved)) in parameters.iter().zip(moved).enumerate() {
                 let db = jacobian.d_params.column(parameter).into_owned();
                 let change = bearing_change(&bearing, &angular.direction, &db);
-                let log_sigma = jacobian.d_log_pixel_angle[parameter];
+                let log_sigma = moved.d_log_pixel_angle(&bearing, &db, pixel_angle);
                 for row in 0..2 {
                     out.extra[row][k] =
                         weight * angular.wrt_direction[row].dot(&change) - out.residual[row] * log_sigma;
@@ -369,10 +476,29 @@ impl Model<POSE_DIM> for Spherical {
         cost
     }
 
-    fn block_terms_cost(&self) -> f64 {
-        let cost =
+    fn linearize_extra_terms(&self, add: ExtraTerm<'_>) -> f64 {
+        let mut cost = 0.0;
+        for prior in &self.parameter_priors {
+            let r = prior.residual(&self.cameras);
+            cost += 0.5 * r * r;
+            for &(row, _, weight) in &prior.terms {
+                add(
+                    prior.extra,
+                    row,
+                    r * weight,
+                    &mut prior.terms.iter().map(|(at, _, by)| (*at, by * weight)),
+                );
+            }
+        }
+        cost
+    }
+
+    fn prior_cost(&self) -> f64 {
+        let of_pose =
             |prior: &Prior| 0.5 * prior.loss.evaluate(prior.residual(&self.candidate_poses).norm_squared()).0;
-        self.priors.iter().map(cost).sum()
+        let of_parameter = |prior: &ParameterPrior| 0.5 * prior.residual(&self.candidate_cameras).powi(2);
+        let of_poses: f64 = self.priors.iter().map(of_pose).sum();
+        of_poses + self.parameter_priors.iter().map(of_parameter).sum::<f64>()
     }
 
     fn propose(&mut self, step: &[f64]) -> bool {
@@ -385,7 +511,7 @@ impl Model<POSE_DIM> for Spherical {
             self.candidate_poses[pose as usize] = PoseState::new(Rigid::new(rotation, translation));
         }
         let mut next = self.pose_of_block.len() * POSE_DIM;
-        for (camera, parameters) in &self.intrinsics {
+        for FreeIntrinsics { camera, parameters, .. } in &self.intrinsics {
             let (current, candidate) =
                 (&self.cameras[*camera as usize], &mut self.candidate_cameras[*camera as usize]);
             for &parameter in parameters {
@@ -406,10 +532,10 @@ impl Model<POSE_DIM> for Spherical {
         for &pose in &self.pose_of_block {
             self.poses[pose as usize] = self.candidate_poses[pose as usize];
         }
-        for (camera, _) in &self.intrinsics {
-            self.cameras[*camera as usize]
-                .params
-                .copy_from_slice(&self.candidate_cameras[*camera as usize].params);
+        for free in &mut self.intrinsics {
+            let camera = &mut self.cameras[free.camera as usize];
+            camera.params.copy_from_slice(&self.candidate_cameras[free.camera as usize].params);
+            free.refresh(camera);
         }
     }
 
@@ -454,39 +580,4 @@ fn free_parameters(camera: &Camera, freedom: IntrinsicsFreedom) -> Vec<usize> {
                 || (*index >= principal.end && freedom.distortion)
         })
         .collect()
-}
-
-/// A bearing with its derivatives by the intrinsics.
-struct UnprojectJacobian {
-    bearing: Vector3<f64>,
-    /// ∂bearing/∂params, 3×8; columns beyond the model's parameters are zero.
-    d_params: SMatrix<f64, 3, MAX_CAMERA_PARAMS>,
-    pixel_angle: f64,
-    /// ∂ ln(pixel angle)/∂params.
-    d_log_pixel_angle: [f64; MAX_CAMERA_PARAMS],
-}
-
-/// κ and its derivatives by the intrinsics, by central differences.
-fn unproject_with_jacobian(camera: &Camera, pixel: &Vector2<f64>) -> Option<UnprojectJacobian> {
-    let (bearing, pixel_angle) = camera.ray(pixel)?;
-    let mut result = UnprojectJacobian {
-        bearing,
-        d_params: SMatrix::zeros(),
-        pixel_angle,
-        d_log_pixel_angle: [0.0; MAX_CAMERA_PARAMS],
-    };
-    let mut moved = camera.clone();
-    for (index, &value) in camera.params.iter().enumerate().take(MAX_CAMERA_PARAMS) {
-        let h = 1e-6 * value.abs().max(1.0);
-        let mut at = |value: f64| {
-            moved.params[index] = value;
-            moved.ray(pixel)
-        };
-        if let (Some((after, angle_after)), Some((before, angle_before))) = (at(value + h), at(value - h)) {
-            result.d_params.set_column(index, &((after - before) / (2.0 * h)));
-            result.d_log_pixel_angle[index] = (angle_after / angle_before).ln() / (2.0 * h);
-        }
-        moved.params[index] = value;
-    }
-    Some(result)
 }

@@ -222,7 +222,10 @@ fn points_alone_are_found_when_all_poses_are_fixed() {
 fn shared_focal_length_is_recovered() {
     let truth = scene(8, 400, 0.0, 15);
     let mut problem = truth.clone();
-    problem.camera_freedom = vec![IntrinsicsFreedom::LENS, IntrinsicsFreedom::LENS];
+    problem.camera_freedom = vec![
+        IntrinsicsFreedom::FREE,
+        IntrinsicsFreedom { principal_point: false, ..IntrinsicsFreedom::FREE },
+    ];
     problem.cameras[1].params[0] = 840.0;
     problem.cameras[1].params[1] = 850.0;
     perturb(&mut problem, 0.02, 16);
@@ -247,6 +250,52 @@ fn principal_point_is_recovered_when_it_is_free() {
     let params = &problem.cameras[1].params;
     assert!((params[2] - 800.0).abs() < 1e-5 && (params[3] - 600.0).abs() < 1e-5, "{params:?}");
     assert_eq!(params[..2], truth.cameras[1].params[..2]);
+}
+
+#[test]
+fn what_is_known_of_a_camera_counts_by_its_standard_deviation() {
+    let mut seen = scene(4, 300, 0.0, 29);
+    seen.poses.iter_mut().for_each(|pose| pose.fixed = true);
+    seen.points.iter_mut().for_each(|point| point.fixed = true);
+    seen.camera_freedom = vec![IntrinsicsFreedom::FREE, IntrinsicsFreedom::FREE];
+    let found = |sigma: f64, aspect_sigma: f64| {
+        let known = |value: f64| ParameterEstimate { value, sigma };
+        let parameters = [860.0, 900.0, 790.0, 606.0].map(known).to_vec();
+        let mut problem = seen.clone();
+        problem.camera_priors.push(CameraPrior { camera: 1, parameters, aspect_sigma });
+        let report = solve(&BundleParams { max_iterations: 200, ..tight() }, &mut problem);
+        (problem.cameras[1].params.clone(), report)
+    };
+    let near = |found: &[f64], wanted: [f64; 4], tolerance: f64| {
+        assert!(found.iter().zip(wanted).all(|(a, b)| (a - b).abs() < tolerance), "{found:?} {wanted:?}");
+    };
+    let (of_the_photo, loose) = found(1e6, f64::INFINITY);
+    near(&of_the_photo, [900.0, 900.0, 800.0, 600.0], 1e-3);
+    near(&found(1e-6, f64::INFINITY).0, [860.0, 900.0, 790.0, 606.0], 1e-3);
+    // Square pixels, by all means, between two focal lengths that are known alike.
+    let (square, both) = found(1e-3, 1e-9);
+    near(&square, [880.0, 880.0, 790.0, 606.0], 0.1);
+    assert_eq!((loose.degrees_of_freedom + 1, both.ignored), (both.degrees_of_freedom, 0));
+    // Of a camera that is not there, or not as it is.
+    let mut wrong = seen.clone();
+    for (camera, parameters) in [(9, 4), (1, 3)] {
+        let parameters = vec![ParameterEstimate { value: 0.0, sigma: 1.0 }; parameters];
+        wrong.camera_priors.push(CameraPrior { camera, parameters, aspect_sigma: 0.1 });
+    }
+    assert_eq!(solve(&tight(), &mut wrong).ignored, 2);
+}
+
+#[test]
+fn usual_photos_have_their_principal_point_in_the_middle_and_panoramas_nothing_to_estimate() {
+    let params = vec![1180.0, 1185.0, 803.0, 596.0, -0.06, 0.02, 0.0, 0.0];
+    let photo = Camera { model: CameraModel::Opencv, width: 1600, height: 1200, params };
+    let CameraPrior { camera, parameters, aspect_sigma } = CameraPrior::of_usual_photo(3, &photo).unwrap();
+    let values: Vec<f64> = parameters.iter().map(|known| known.value).collect();
+    assert_eq!((camera, values), (3, vec![0.0, 0.0, 800.0, 600.0, 0.0, 0.0, 0.0, 0.0]));
+    assert!(parameters[..2].iter().all(|focal| focal.sigma == f64::INFINITY));
+    assert!(parameters[6].sigma < parameters[5].sigma && parameters[5].sigma < parameters[4].sigma);
+    assert!(aspect_sigma < 0.01);
+    assert_eq!(CameraPrior::of_usual_photo(0, &Camera::equirectangular(200, 100)), None);
 }
 
 #[test]
@@ -315,7 +364,7 @@ fn odd_input_is_survived_and_counted() {
 #[test]
 fn bytes_do_not_depend_on_the_number_of_threads() {
     let mut start = scene(12, 1500, 0.5, 22);
-    start.camera_freedom = vec![IntrinsicsFreedom::FIXED, IntrinsicsFreedom::LENS];
+    start.camera_freedom = vec![IntrinsicsFreedom::FIXED, IntrinsicsFreedom::FREE];
     perturb(&mut start, 0.02, 23);
     for linear_solver in [LinearSolver::Direct, LinearSolver::Iterative] {
         let params = BundleParams { linear_solver, ..BundleParams::default() };
@@ -334,10 +383,7 @@ fn bytes_do_not_depend_on_the_number_of_threads() {
 #[test]
 fn conjugate_gradients_reach_the_optimum_of_cholesky() {
     let mut start = scene(10, 500, 0.7, 27);
-    start.camera_freedom = vec![
-        IntrinsicsFreedom::FIXED,
-        IntrinsicsFreedom { principal_point: true, ..IntrinsicsFreedom::LENS },
-    ];
+    start.camera_freedom = vec![IntrinsicsFreedom::FIXED, IntrinsicsFreedom::FREE];
     for (pose, of_pose) in start.poses.iter().enumerate() {
         let position = of_pose.world_from_camera.translation + Vector3::new(0.01, -0.02, 0.005);
         let loss = RobustLoss::Cauchy(3.0);

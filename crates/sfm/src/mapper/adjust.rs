@@ -5,7 +5,7 @@ use crate::{
     ImageId, Observation, PointId,
     bundle::{
         self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, BundleReport,
-        IntrinsicsFreedom,
+        CameraPrior, IntrinsicsFreedom,
     },
 };
 
@@ -82,7 +82,9 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
                 .filter(|image| model.input.images[image.index()].camera.index() == camera)
                 .count();
             if !fixed && users >= 2 {
-                problem.camera_freedom[camera] = IntrinsicsFreedom::LENS;
+                problem.camera_freedom[camera] = IntrinsicsFreedom::FREE;
+                let usual = CameraPrior::of_usual_photo(camera as u32, &model.cameras[camera]);
+                problem.camera_priors.extend(usual);
             }
         }
     }
