@@ -60,7 +60,7 @@ fn main() {
             let models = std::slice::from_ref(&world.local);
             let no_views = || Ok::<_, Infallible>(Views::default());
             let Ok(found) =
-                locate_set(&CamsetParams::default(), &scene, &photos, &alone, models, no_views, seed);
+                locate_set(&CamsetParams::default(), &scene, &photos, &alone, models.into(), no_views, seed);
             localized += usize::from(found.refined.iter().all(|photo| photo.verdict == Verdict::Localized));
             for (errors, photos) in errors.iter_mut().zip([&found.rigid, &found.refined]) {
                 for (errors, error) in errors.iter_mut().zip(worst(&world, photos).into_iter().flatten()) {

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
+use setloc_sfm::PairGeometry;
 
 /// What ties two photos, or the scene and a photo, together.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -31,6 +32,9 @@ pub struct PathToScene {
     pub photo: String,
     /// The links from the scene to the photo; empty when nothing leads there.
     pub links: Vec<Link>,
+    /// Where too little leads there: verified matches of two photos that are missing on the way, as they tell no distance (those
+    /// of one wall).
+    pub open: Option<Link>,
 }
 
 impl PathToScene {
@@ -41,20 +45,25 @@ impl PathToScene {
 
     /// What to do about a photo that is not localized well.
     pub fn advice(&self) -> String {
-        match self.weakest() {
-            None => format!(
+        match (self.weakest(), &self.open) {
+            (_, Some(Link { from: Some(from), to, shared })) => format!(
+                "{}: its weakest link: {from} and {to} share {shared} matches, which do not tell how far apart they were \
+                 taken, as those of one wall; take another photo between {from} and {to} that also shows something near",
+                self.photo
+            ),
+            (None, _) => format!(
                 "{}: shares nothing with the scene or with photos that do; take photos on the way from the scene to it, \
                  each overlapping the one before by more than half",
                 self.photo
             ),
-            Some(link @ Link { from: None, .. }) => format!(
+            (Some(link @ Link { from: None, .. }), _) => format!(
                 "{}: its weakest link is the one to the scene: {}; take a photo nearer to the panoramas than {}, \
                  towards the same surfaces",
                 self.photo,
                 link.sentence(),
                 link.to
             ),
-            Some(link @ Link { from: Some(from), .. }) => format!(
+            (Some(link @ Link { from: Some(from), .. }), _) => format!(
                 "{}: its weakest link: {}; take another photo between {from} and {}",
                 self.photo,
                 link.sentence(),
@@ -105,13 +114,59 @@ pub(crate) fn widest_paths(
                 at = from;
             }
             links.reverse();
-            PathToScene { photo: names[photo].to_owned(), links }
+            PathToScene { photo: names[photo].to_owned(), links, open: None }
         })
         .collect()
 }
 
+/// Names, for photos that links of fewer points than `enough` lead to, what is missing on the widest way to them: the
+/// weakest of its pairs that tell no distance. Of `photo_links` (as for [`widest_paths`]) all are wide enough.
+pub(crate) fn name_open_pairs(
+    paths: &mut [PathToScene],
+    photo_links: &BTreeMap<(usize, usize), usize>,
+    open: &[PairGeometry],
+    enough: usize,
+) {
+    let tied = photo_links.keys().map(|&(a, b)| (a, b, usize::MAX));
+    let of_pair =
+        |pair: &PairGeometry| (pair.first.index(), pair.second.index(), pair.two_view.inliers.len());
+    let links: Vec<(usize, usize, usize)> = tied.chain(open.iter().map(of_pair)).collect();
+    let is_reached = |path: &PathToScene| path.weakest().is_some_and(|link| link.shared >= enough);
+    let mut width: Vec<usize> =
+        paths.iter().map(|path| if is_reached(path) { usize::MAX } else { 0 }).collect();
+    let mut missing: Vec<Option<(usize, usize)>> = vec![None; paths.len()];
+    let mut done = vec![false; paths.len()];
+    while let Some(next) = (0..paths.len())
+        .filter(|&photo| !done[photo] && width[photo] > 0)
+        .max_by_key(|&photo| (width[photo], std::cmp::Reverse(photo)))
+    {
+        done[next] = true;
+        for &(a, b, shared) in links.iter().filter(|(a, b, _)| *a == next || *b == next) {
+            let other = if a == next { b } else { a };
+            let reaches = shared.min(width[next]);
+            if width.get(other).is_some_and(|width| reaches > *width) {
+                missing[other] = if shared < width[next] { Some((next, other)) } else { missing[next] };
+                width[other] = reaches;
+            }
+        }
+    }
+    let names: Vec<String> = paths.iter().map(|path| path.photo.clone()).collect();
+    for ((path, missing), shared) in paths.iter_mut().zip(missing).zip(width) {
+        let link = |(from, to): (usize, usize)| Link {
+            from: Some(names[from].clone()),
+            to: names[to].clone(),
+            shared,
+        };
+        path.open = missing.map(link);
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector3;
+    use setloc_features::Match;
+    use setloc_sfm::{ImageId, Rigid, TwoView, TwoViewKind};
+
     use super::*;
 
     #[test]
@@ -124,6 +179,36 @@ mod tests {
         assert!(target.advice().contains("between b and c"), "{}", target.advice());
         assert_eq!(paths[0].links.len(), 1);
         assert!(paths[0].advice().contains("150 scene points"));
+    }
+
+    #[test]
+    fn matches_that_tell_no_distance_are_named() {
+        let pair = |first, second, matches: u32| PairGeometry {
+            first: ImageId(first),
+            second: ImageId(second),
+            two_view: TwoView {
+                kind: TwoViewKind::General,
+                second_from_first: Rigid::new(nalgebra::UnitQuaternion::identity(), Vector3::x()),
+                inliers: (0..matches).map(|at| Match { first: at, second: at }).collect(),
+                median_parallax_rad: 0.1,
+            },
+        };
+        let names = ["a", "b", "c", "d", "e"];
+        let mut paths = widest_paths(&names, &[30, 20, 11, 0, 0], &BTreeMap::new());
+        // The widest way to d leads by c, to which b leads.
+        let open = [
+            pair(0, 2, 40),
+            pair(2, 1, 90),
+            pair(1, 0, 500),
+            pair(2, 3, 70),
+            pair(9, 2, 800),
+            pair(3, 0, 30),
+        ];
+        name_open_pairs(&mut paths, &BTreeMap::from([((2, 4), 60)]), &open, 12);
+        assert!(paths[2].advice().contains("b and c share 90 matches, which do not tell how far"));
+        assert!(paths[4].advice().starts_with("e: its weakest link: b and c share 90 matches"));
+        assert!(paths[3].advice().starts_with("d: its weakest link: c and d share 70 matches"));
+        assert!([0, 1].iter().all(|&at| paths[at].open.is_none()));
     }
 
     #[test]

@@ -309,7 +309,8 @@ mod tests {
         let borrowed: Vec<&SingleLocalization> = alone.iter().collect();
         let (params, models) = (CamsetParams::default(), std::slice::from_ref(&world.local));
         let views = || Ok::<_, Infallible>(Views::default());
-        let Ok(set) = locate_set(&params, &world.scene(), &world.queries(), &borrowed, models, views, 7);
+        let Ok(set) =
+            locate_set(&params, &world.scene(), &world.queries(), &borrowed, models.into(), views, 7);
         (set, alone)
     }
 

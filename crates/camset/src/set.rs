@@ -11,10 +11,10 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use setloc_sfm::{CameraId, ImageId, Reconstruction, ReconstructionImage, Rigid};
 
-use crate::advice::{Link, widest_paths};
+use crate::advice::{Link, name_open_pairs, widest_paths};
 use crate::{
-    CamsetParams, PhotoLocalization, PlacedModel, QueryPhoto, Scene, SetLocalization, SingleLocalization,
-    Verdict, Views, verdict::standard_deviations,
+    CamsetParams, LocalModels, PhotoLocalization, PlacedModel, QueryPhoto, Scene, SetLocalization,
+    SingleLocalization, Verdict, Views, verdict::standard_deviations,
 };
 
 use joint::{Component, ComponentAnswer};
@@ -23,7 +23,7 @@ pub use merged::locate_set_anywhere;
 
 /// Localizes a set in one component of the scene, through its local models (components of the photos' own reconstruction, largest first).
 ///
-/// Image ids of `local_models` are indices into `photos`; models with fewer than two registered photos are left out.
+/// Models with fewer than two registered photos are left out.
 /// `alone` is what [`locate_single`](crate::locate_single) says of each photo; photos beyond its end are left out.
 /// Every other photo gets an answer: from the first model that localizes it, else alone. (L. Deng et al., "Image set
 /// querying based localization", VCIP 2015.)
@@ -38,7 +38,7 @@ pub fn locate_set<E>(
     scene: &Scene<'_>,
     photos: &[QueryPhoto<'_>],
     alone: &[&SingleLocalization],
-    local_models: &[Reconstruction],
+    local_models: LocalModels<'_>,
     views: impl FnOnce() -> Result<Views, E>,
     seed: u64,
 ) -> Result<SetLocalization, E> {
@@ -50,7 +50,7 @@ fn answer<E>(
     scene: &Scene<'_>,
     photos: &[QueryPhoto<'_>],
     alone: &[&SingleLocalization],
-    local_models: &[Reconstruction],
+    local_models: LocalModels<'_>,
     views: impl FnOnce() -> Result<Views, E>,
     seed: u64,
 ) -> Result<Answer, E> {
@@ -149,7 +149,7 @@ fn locate_by(
     params: &CamsetParams,
     scene: &Scene<'_>,
     (photos, evidence): (&[QueryPhoto<'_>], &[&SingleLocalization]),
-    local_models: &[Reconstruction],
+    local_models: LocalModels<'_>,
     views: &Views,
     seed: u64,
 ) -> Answer {
@@ -161,12 +161,15 @@ fn locate_by(
     let mut scene_links: Vec<usize> =
         evidence.iter().map(|e| e.photo.world_from_camera.map_or(0, |_| e.photo.inliers)).collect();
     let mut photo_links: BTreeMap<(usize, usize), usize> = BTreeMap::new();
-    let by_themselves =
-        if views.matches.is_empty() { Vec::new() } else { left_alone(photos, evidence, local_models) };
-    for (number, model) in local_models.iter().chain(&by_themselves).enumerate() {
+    let by_themselves = if views.matches.is_empty() {
+        Vec::new()
+    } else {
+        left_alone(photos, evidence, local_models.components)
+    };
+    for (number, model) in local_models.components.iter().chain(&by_themselves).enumerate() {
         let members: Vec<usize> =
             model.registered().map(ImageId::index).filter(|&photo| photo < photos.len()).collect();
-        if members.len() < 2 && number < local_models.len() {
+        if members.len() < 2 && number < local_models.components.len() {
             continue;
         }
         for (pair, shared) in shared_points(model) {
@@ -203,6 +206,8 @@ fn locate_by(
     }
     let names: Vec<&str> = photos.iter().map(|photo| photo.name).collect();
     answer.paths = widest_paths(&names, &scene_links, &photo_links);
+    let enough = params.verdict.min_inliers;
+    name_open_pairs(&mut answer.paths, &photo_links, local_models.open, enough);
     answer.rigid = or_alone(rigid, evidence);
     answer.refined = or_alone(refined, evidence);
     for (photo, path) in answer.refined.iter_mut().zip(&answer.paths) {
@@ -349,8 +354,15 @@ mod tests {
         seed: u64,
     ) -> SetLocalization {
         let alone: Vec<&SingleLocalization> = alone.iter().collect();
-        let Ok(found) =
-            locate_set(params, scene, photos, &alone, local_models, || Ok::<_, Infallible>(views()), seed);
+        let Ok(found) = locate_set(
+            params,
+            scene,
+            photos,
+            &alone,
+            local_models.into(),
+            || Ok::<_, Infallible>(views()),
+            seed,
+        );
         found
     }
 
@@ -465,7 +477,7 @@ mod tests {
             let alone: Vec<&SingleLocalization> = alone.iter().collect();
             let models = std::slice::from_ref(&world.local);
             let (params, queries) = (CamsetParams::default(), world.queries());
-            locate_set(&params, &world.scene(), &queries, &alone, models, || Err("damaged"), 7)
+            locate_set(&params, &world.scene(), &queries, &alone, models.into(), || Err("damaged"), 7)
         };
         assert!(locate(&world).is_ok());
         world.forget_seen_points();
@@ -507,6 +519,7 @@ mod tests {
         let path = |shared| PathToScene {
             photo: "photo".to_owned(),
             links: vec![Link { from: None, to: "photo".to_owned(), shared }],
+            open: None,
         };
         let answer = |photos: Vec<PhotoLocalization>| Answer {
             elsewhere: vec![false; photos.len()],

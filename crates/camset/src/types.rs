@@ -2,7 +2,7 @@ use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Calibration, Camera, ImageFeatures};
 use setloc_index::{NearestPoints, SceneIndex};
-use setloc_sfm::{ImageId, PointId, Reconstruction, Rigid, Similarity};
+use setloc_sfm::{ImageId, PairGeometry, PointId, Reconstruction, Rigid, Similarity};
 
 use crate::PathToScene;
 
@@ -43,6 +43,21 @@ pub struct QueryPhoto<'a> {
     pub calibration: Calibration,
     /// Its features.
     pub features: &'a ImageFeatures,
+}
+
+/// What a set's photos tell of each other.
+#[derive(Debug, Clone, Copy)]
+pub struct LocalModels<'a> {
+    /// Components of the set's reconstruction; image `i` of each is photo `i`.
+    pub components: &'a [Reconstruction],
+    /// Verified pairs of photos that no component holds both of: nothing tells how far these stand apart.
+    pub open: &'a [PairGeometry],
+}
+
+impl<'a> From<&'a [Reconstruction]> for LocalModels<'a> {
+    fn from(components: &'a [Reconstruction]) -> Self {
+        Self { components, open: &[] }
+    }
 }
 
 /// The answer in one word.

@@ -119,4 +119,4 @@ serde_artifact!(MapperOutput, "model", 8);
 serde_artifact!(SceneIndices, "index", 2);
 serde_artifact!(AnywhereLocalization, "photo localization", 3);
 serde_artifact!(Growth, "growth", 1);
-serde_artifact!(SetLocalization, "set localization", 3);
+serde_artifact!(SetLocalization, "set localization", 4);

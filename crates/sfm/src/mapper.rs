@@ -268,21 +268,35 @@ pub struct MapperReport {
 pub struct MapperOutput {
     /// Connected components, largest first.
     pub components: Vec<Reconstruction>,
-    /// Verified pairs of an image of a component and one of none.
+    /// Verified pairs of images that no component holds both of.
     pub open_pairs: Vec<PairGeometry>,
     /// What happened.
     pub report: MapperReport,
 }
 
 impl MapperOutput {
-    /// Those of some pairs that are of an image of a component and one of none.
+    /// Those of some pairs whose images no component holds both of.
     pub fn open_among(&self, pairs: &[PairGeometry]) -> Vec<PairGeometry> {
-        let is_registered = |image: ImageId| {
-            let poses = self.components.iter().map(|model| model.images[image.index()].world_from_camera);
-            poses.flatten().next().is_some()
+        let is_open = |pair: &&PairGeometry| {
+            let first = self.component_of(pair.first);
+            first.is_none() || first != self.component_of(pair.second)
         };
-        let is_open = |pair: &&PairGeometry| is_registered(pair.first) != is_registered(pair.second);
         pairs.iter().filter(is_open).cloned().collect()
+    }
+
+    /// Those of some pairs that are of an image of a component and one of none.
+    pub fn waiting_among(&self, pairs: &[PairGeometry]) -> Vec<PairGeometry> {
+        let is_registered = |image: ImageId| self.component_of(image).is_some();
+        let waits = |pair: &&PairGeometry| is_registered(pair.first) != is_registered(pair.second);
+        pairs.iter().filter(waits).cloned().collect()
+    }
+
+    /// The first component that an image is registered in.
+    fn component_of(&self, image: ImageId) -> Option<usize> {
+        let holds = |model: &Reconstruction| {
+            model.images.get(image.index()).is_some_and(|image| image.world_from_camera.is_some())
+        };
+        self.components.iter().position(holds)
     }
 }
 

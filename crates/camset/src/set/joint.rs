@@ -38,7 +38,7 @@ pub(crate) enum ComponentAnswer {
     Localized(Box<ComponentPoses>),
     Refused {
         reasons: Vec<String>,
-        /// Matches to the scene of each photo, right or wrong.
+        /// Matches to the scene of each photo that agree with the best pose.
         scene_points: Vec<usize>,
     },
 }
@@ -215,10 +215,6 @@ impl Component<'_> {
         }
         let candidates =
             correspondences(params, self.scene.index, self.model, self.members, &rays, self.evidence);
-        let mut scene_points = vec![0; self.members.len()];
-        for &(slot, _) in candidates.iter().flat_map(|candidate| &candidate.seen_by) {
-            scene_points[slot] += 1;
-        }
         let set_rays = set_rays(params, self.scene.index, &set_from_camera, &rays, &candidates);
         let photos =
             SetPhotos { set_from_camera: &set_from_camera, members: self.members, evidence: self.evidence };
@@ -227,12 +223,16 @@ impl Component<'_> {
         let Some(rigid) = rigid else {
             let reasons =
                 vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];
-            return ComponentAnswer::Refused { reasons, scene_points };
+            return ComponentAnswer::Refused { reasons, scene_points: vec![0; self.members.len()] };
         };
         let mut reasons = Vec::new();
         let mut evidence = self.support(&rays, &set_from_camera, &candidates, &sights, &rigid);
         if evidence.inliers < params.verdict.min_inliers {
             judge_support(&params.verdict, &evidence, &mut reasons);
+            let mut scene_points = vec![0; self.members.len()];
+            for &(slot, _) in rigid.agreeing.iter().flat_map(|&agreeing| &candidates[agreeing].seen_by) {
+                scene_points[slot] += 1;
+            }
             return ComponentAnswer::Refused { reasons, scene_points };
         }
         let mut joint = self.refine_jointly(&set_from_camera, &candidates, &sights, &rigid);

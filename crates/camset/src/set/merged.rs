@@ -1,11 +1,9 @@
 //! The set in all components of a scene: each component's answer, then for each photo the one that says most.
 
-use setloc_sfm::Reconstruction;
-
 use super::{Answer, Remark, answer};
 use crate::anywhere::{Candidate, choose, is_rival};
 use crate::{
-    AnywhereLocalization, CamsetParams, PhotoLocalization, QueryPhoto, Scene, SetLocalization,
+    AnywhereLocalization, CamsetParams, LocalModels, PhotoLocalization, QueryPhoto, Scene, SetLocalization,
     SingleLocalization, Verdict, VerdictParams, Views,
 };
 
@@ -23,7 +21,7 @@ pub fn locate_set_anywhere<E>(
     components: &[Scene<'_>],
     photos: &[QueryPhoto<'_>],
     alone: &[&AnywhereLocalization],
-    local_models: &[Reconstruction],
+    local_models: LocalModels<'_>,
     views: impl Fn(&Scene<'_>, &[&SingleLocalization]) -> Result<Views, E>,
     seed: u64,
 ) -> Result<SetLocalization, E> {
@@ -146,7 +144,8 @@ mod tests {
         let views = |_: &Scene<'_>, _: &[&SingleLocalization]| Ok::<_, Infallible>(Views::default());
         let models = std::slice::from_ref(&world.local);
         let params = CamsetParams::default();
-        let Ok(found) = locate_set_anywhere(&params, components, &world.queries(), &alone, models, views, 7);
+        let Ok(found) =
+            locate_set_anywhere(&params, components, &world.queries(), &alone, models.into(), views, 7);
         found
     }
 
@@ -156,7 +155,8 @@ mod tests {
         let alone: Vec<&SingleLocalization> = alone.iter().collect();
         let views = || Ok::<_, Infallible>(Views::default());
         let (params, models) = (CamsetParams::default(), std::slice::from_ref(&world.local));
-        let Ok(found) = locate_set(&params, &world.scene(), &world.queries(), &alone, models, views, 7);
+        let Ok(found) =
+            locate_set(&params, &world.scene(), &world.queries(), &alone, models.into(), views, 7);
         found
     }
 
@@ -219,7 +219,8 @@ mod tests {
         let borrowed: Vec<&AnywhereLocalization> = alone.iter().collect();
         let (params, models) = (CamsetParams::default(), std::slice::from_ref(&elsewhere.local));
         let photos = elsewhere.queries();
-        let Ok(found) = locate_set_anywhere(&params, &components, &photos, &borrowed, models, views, 7);
+        let Ok(found) =
+            locate_set_anywhere(&params, &components, &photos, &borrowed, models.into(), views, 7);
         assert_eq!(asked.get(), 2);
         assert!(found.refined.iter().all(|photo| photo.verdict == Verdict::NotLocalized));
         assert!(found.placed.is_empty());

@@ -175,8 +175,12 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     for set in set_folders(root)? {
         let name = set.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         // A set of nothing readable leaves the others as they are.
-        let read = list_below(root, &set)
-            .and_then(|files| Ok((ImageFolder::read(&files, &cameras, &GeoSource::None, None)?, files)));
+        let read = list_below(root, &set).and_then(|files| {
+            // One file is for all folders; it need not know this one's cameras.
+            let knows_any = files.iter().any(|(name, path)| cameras.find(name, path).is_some());
+            let known = if knows_any { &cameras } else { &CameraBook::default() };
+            Ok((ImageFolder::read(&files, known, &GeoSource::None, None)?, files))
+        });
         let (mut photos, files) = match read {
             Ok(read) => read,
             Err(error) => {

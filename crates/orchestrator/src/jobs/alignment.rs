@@ -75,7 +75,7 @@ fn run_alignment(
         features.push(inputs.get::<ImageFeatures>(&features_role(*at))?);
     }
     let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
-    let mut open_pairs = std::mem::take(&mut output.open_pairs);
+    let mut waiting = output.waiting_among(&output.open_pairs);
     for component in &mut output.components {
         let wraps: Vec<bool> = component
             .images
@@ -86,8 +86,8 @@ fn run_alignment(
         let load = |image: ImageId| pyramids.get(&sources[image_at[image.index()]], wraps[image.index()]);
         let report = align_tracks(params, component, &features, camera_fixed, load)?;
         sharpen_lengths(component, load)?;
-        let registered = register_by_ground(component, &open_pairs, &features, load)?;
-        open_pairs.retain(|pair| ![pair.first, pair.second].iter().any(|image| registered.contains(image)));
+        let registered = register_by_ground(component, &waiting, &features, load)?;
+        waiting.retain(|pair| ![pair.first, pair.second].iter().any(|image| registered.contains(image)));
         if report.aligned * 5 < report.sought {
             output.report.warnings.push(format!(
                 "the pixels round only {} of {} matched keypoints agree",
@@ -95,6 +95,7 @@ fn run_alignment(
             ));
         }
     }
+    output.open_pairs = output.open_among(&output.open_pairs);
     Product::new(output)
 }
 

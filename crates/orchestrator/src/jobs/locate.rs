@@ -4,8 +4,8 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use serde_json::json;
 use setloc_camset::{
-    AnywhereLocalization, QueryPhoto, Scene, SetLocalization, SingleLocalization, Views, likely_images,
-    locate_set_anywhere, locate_single_anywhere, match_views,
+    AnywhereLocalization, LocalModels, QueryPhoto, Scene, SetLocalization, SingleLocalization, Views,
+    likely_images, locate_set_anywhere, locate_single_anywhere, match_views,
 };
 use setloc_features::ImageFeatures;
 use setloc_index::SceneIndex;
@@ -108,7 +108,8 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
         let pairs = (&what.config.matching, &what.config.two_view);
         Ok(match_views(&what.config.camset.views, pairs, scene, features, &likely, &queries, seed))
     };
-    let (params, models) = (&what.config.camset, &model.components);
+    let models = LocalModels { components: &model.components, open: &model.open_pairs };
+    let params = &what.config.camset;
     let located: SetLocalization =
         locate_set_anywhere(params, &components, &queries, &alone, models, views, seed)?;
     Product::new(located)
