@@ -970,7 +970,43 @@ impl<'a> Mapper<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{ReconstructionImage, ReconstructionPoint};
+    use crate::{ReconstructionImage, ReconstructionPoint, TwoView, TwoViewKind};
+
+    #[test]
+    fn pairs_that_no_component_holds_both_images_of_are_open() {
+        let component = |registered: [bool; 4]| Reconstruction {
+            cameras: vec![Camera::equirectangular(200, 100)],
+            images: registered
+                .map(|is_registered| ReconstructionImage {
+                    name: String::new(),
+                    camera: CameraId(0),
+                    world_from_camera: is_registered.then(Rigid::identity),
+                })
+                .to_vec(),
+            points: Vec::new(),
+            lengths: Vec::new(),
+        };
+        let components = vec![component([true, true, false, false]), component([false, false, true, false])];
+        let output = MapperOutput { components, ..MapperOutput::default() };
+        let two_view = TwoView {
+            kind: TwoViewKind::General,
+            second_from_first: Rigid::identity(),
+            inliers: Vec::new(),
+            median_parallax_rad: 0.1,
+        };
+        let pair = |(first, second)| PairGeometry {
+            first: ImageId(first),
+            second: ImageId(second),
+            two_view: two_view.clone(),
+        };
+        let pairs = [(0, 1), (1, 2), (3, 0), (2, 3), (3, 9)].map(pair);
+        let ends = |pairs: Vec<PairGeometry>| {
+            pairs.iter().map(|pair| (pair.first.0, pair.second.0)).collect::<Vec<_>>()
+        };
+        assert_eq!(ends(output.open_among(&pairs)), [(1, 2), (3, 0), (2, 3), (3, 9)]);
+        // The third image has a place already, if in another component.
+        assert_eq!(ends(output.waiting_among(&pairs)), [(3, 0), (2, 3)]);
+    }
 
     #[test]
     fn images_that_next_to_no_point_holds_lose_their_pose_and_others_keep_theirs() {
