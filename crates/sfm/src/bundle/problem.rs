@@ -103,7 +103,12 @@ pub struct CameraPrior {
     pub parameters: Vec<ParameterEstimate>,
     /// Standard deviation of the ratio of a camera's two focal lengths from 1.
     pub aspect_sigma: f64,
+    /// Loss on each of these, in standard deviations.
+    pub loss: RobustLoss,
 }
+
+/// Scale of the loss on what holds for the usual photo, in standard deviations.
+const UNUSUAL: f64 = 2.0;
 
 impl CameraPrior {
     /// What holds for the usual photo, as standard deviations: the principal point lies within 0.5 % of the longer side of
@@ -111,7 +116,8 @@ impl CameraPrior {
     /// 0.001, and pixels are square to 0.1 %; nothing is known of the focal length. `None` for panoramas, which have
     /// nothing to estimate.
     ///
-    /// Calibrations of phones, action and system cameras put the principal point 0.1–1 % off the centre.
+    /// Calibrations of phones, action and system cameras put the principal point 0.1–1 % off the centre. Photos that were
+    /// cropped have it anywhere, so the loss lets go of what is many deviations off.
     pub fn of_usual_photo(index: u32, camera: &Camera) -> Option<Self> {
         if camera.is_panoramic() {
             return None;
@@ -129,7 +135,7 @@ impl CameraPrior {
             ParameterEstimate { value, sigma }
         };
         let parameters = camera.param_roles().iter().zip(camera.model.param_names()).map(known).collect();
-        Some(Self { camera: index, parameters, aspect_sigma: 0.001 })
+        Some(Self { camera: index, parameters, aspect_sigma: 0.001, loss: RobustLoss::Cauchy(UNUSUAL) })
     }
 
     /// Whether it is one of this camera, in numbers that can be weighed.
@@ -137,6 +143,7 @@ impl CameraPrior {
         camera.is_some_and(|camera| camera.params.len() == self.parameters.len())
             && self.parameters.iter().all(|known| known.value.is_finite() && known.sigma > 0.0)
             && self.aspect_sigma > 0.0
+            && self.loss.is_valid()
     }
 }
 

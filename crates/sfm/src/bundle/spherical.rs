@@ -125,6 +125,7 @@ struct ParameterPrior {
     terms: Vec<(usize, usize, f64)>,
     /// v/σ.
     value: f64,
+    loss: RobustLoss,
 }
 
 impl ParameterPrior {
@@ -136,11 +137,11 @@ impl ParameterPrior {
 
     /// Those of a camera whose free parameters are an extra block.
     fn of_camera(prior: &CameraPrior, camera: &Camera, extra: usize, free: &[usize]) -> Vec<Self> {
-        let index = prior.camera as usize;
+        let (index, loss) = (prior.camera as usize, prior.loss);
         let of_one = |(at, &parameter): (usize, &usize)| {
             let ParameterEstimate { value, sigma } = prior.parameters[parameter];
             let terms = vec![(at, parameter, 1.0 / sigma)];
-            sigma.is_finite().then(|| Self { camera: index, extra, terms, value: value / sigma })
+            sigma.is_finite().then(|| Self { camera: index, extra, terms, value: value / sigma, loss })
         };
         let mut priors: Vec<Self> = free.iter().enumerate().filter_map(of_one).collect();
         let focal = focal_parameters(camera.model);
@@ -151,6 +152,7 @@ impl ParameterPrior {
                 extra,
                 terms: vec![(0, 0, weight), (1, 1, -weight)],
                 value: 0.0,
+                loss,
             });
         }
         priors
@@ -480,14 +482,12 @@ impl Model<POSE_DIM> for Spherical {
         let mut cost = 0.0;
         for prior in &self.parameter_priors {
             let r = prior.residual(&self.cameras);
-            cost += 0.5 * r * r;
-            for &(row, _, weight) in &prior.terms {
-                add(
-                    prior.extra,
-                    row,
-                    r * weight,
-                    &mut prior.terms.iter().map(|(at, _, by)| (*at, by * weight)),
-                );
+            let (rho, weight) = prior.loss.evaluate(r * r);
+            cost += 0.5 * rho;
+            for &(row, _, by_row) in &prior.terms {
+                let by_row = weight * by_row;
+                let mut of_row = prior.terms.iter().map(|(at, _, by_column)| (*at, by_row * by_column));
+                add(prior.extra, row, r * by_row, &mut of_row);
             }
         }
         cost
@@ -496,7 +496,9 @@ impl Model<POSE_DIM> for Spherical {
     fn prior_cost(&self) -> f64 {
         let of_pose =
             |prior: &Prior| 0.5 * prior.loss.evaluate(prior.residual(&self.candidate_poses).norm_squared()).0;
-        let of_parameter = |prior: &ParameterPrior| 0.5 * prior.residual(&self.candidate_cameras).powi(2);
+        let of_parameter = |prior: &ParameterPrior| {
+            0.5 * prior.loss.evaluate(prior.residual(&self.candidate_cameras).powi(2)).0
+        };
         let of_poses: f64 = self.priors.iter().map(of_pose).sum();
         of_poses + self.parameter_priors.iter().map(of_parameter).sum::<f64>()
     }

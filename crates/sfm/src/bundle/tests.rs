@@ -262,7 +262,8 @@ fn what_is_known_of_a_camera_counts_by_its_standard_deviation() {
         let known = |value: f64| ParameterEstimate { value, sigma };
         let parameters = [860.0, 900.0, 790.0, 606.0].map(known).to_vec();
         let mut problem = seen.clone();
-        problem.camera_priors.push(CameraPrior { camera: 1, parameters, aspect_sigma });
+        let loss = RobustLoss::Trivial;
+        problem.camera_priors.push(CameraPrior { camera: 1, parameters, aspect_sigma, loss });
         let report = solve(&BundleParams { max_iterations: 200, ..tight() }, &mut problem);
         (problem.cameras[1].params.clone(), report)
     };
@@ -276,11 +277,19 @@ fn what_is_known_of_a_camera_counts_by_its_standard_deviation() {
     let (square, both) = found(1e-3, 1e-9);
     near(&square, [880.0, 880.0, 790.0, 606.0], 0.1);
     assert_eq!((loose.degrees_of_freedom + 1, both.ignored), (both.degrees_of_freedom, 0));
+    // What is a hundred deviations off is let go of.
+    let mut unusual = seen.clone();
+    let parameters = vec![ParameterEstimate { value: 700.0, sigma: 1.0 }; 4];
+    let loss = RobustLoss::Cauchy(2.0);
+    unusual.camera_priors.push(CameraPrior { camera: 1, parameters, aspect_sigma: 0.1, loss });
+    solve(&BundleParams { max_iterations: 200, ..tight() }, &mut unusual);
+    near(&unusual.cameras[1].params, [900.0, 900.0, 800.0, 600.0], 0.1);
     // Of a camera that is not there, or not as it is.
     let mut wrong = seen.clone();
     for (camera, parameters) in [(9, 4), (1, 3)] {
         let parameters = vec![ParameterEstimate { value: 0.0, sigma: 1.0 }; parameters];
-        wrong.camera_priors.push(CameraPrior { camera, parameters, aspect_sigma: 0.1 });
+        let loss = RobustLoss::Trivial;
+        wrong.camera_priors.push(CameraPrior { camera, parameters, aspect_sigma: 0.1, loss });
     }
     assert_eq!(solve(&tight(), &mut wrong).ignored, 2);
 }
@@ -289,7 +298,8 @@ fn what_is_known_of_a_camera_counts_by_its_standard_deviation() {
 fn usual_photos_have_their_principal_point_in_the_middle_and_panoramas_nothing_to_estimate() {
     let params = vec![1180.0, 1185.0, 803.0, 596.0, -0.06, 0.02, 0.0, 0.0];
     let photo = Camera { model: CameraModel::Opencv, width: 1600, height: 1200, params };
-    let CameraPrior { camera, parameters, aspect_sigma } = CameraPrior::of_usual_photo(3, &photo).unwrap();
+    let CameraPrior { camera, parameters, aspect_sigma, .. } =
+        CameraPrior::of_usual_photo(3, &photo).unwrap();
     let values: Vec<f64> = parameters.iter().map(|known| known.value).collect();
     assert_eq!((camera, values), (3, vec![0.0, 0.0, 800.0, 600.0, 0.0, 0.0, 0.0, 0.0]));
     assert!(parameters[..2].iter().all(|focal| focal.sigma == f64::INFINITY));
