@@ -53,8 +53,9 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// what any of them sees. 14: photos stand where their pair by planes has them, as well as that tells.
 /// 15: only matches hundreds of deviations off are no noise. 16: what points do not localize is matched with the scene's
 /// images. 17, 18: by fewer matches a pair, all photos alike. 19: contradictions are named, advice goes with the answers.
-/// 20: all components of a scene are searched. 21: matches that tell no distance are named.
-pub const VERSION: u32 = 21;
+/// 20: all components of a scene are searched. 21: matches that tell no distance are named. 22: intrinsics that are not
+/// known are free under what holds for usual photos.
+pub const VERSION: u32 = 22;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;
