@@ -9,7 +9,7 @@ use std::sync::atomic::AtomicBool;
 use setloc_camset::{PhotoLocalization, Verdict};
 use setloc_features::Calibration;
 use setloc_orchestrator::bench::{BenchGps, BenchOptions, DatasetFigures, bench_dataset};
-use setloc_orchestrator::building::{BuildOutcome, build_scene};
+use setloc_orchestrator::building::{BuildOutcome, Built, build_scene};
 use setloc_orchestrator::config::Config;
 use setloc_orchestrator::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use setloc_orchestrator::jobs::LocateJobs;
@@ -24,10 +24,21 @@ fn bench(dataset: &Path) -> DatasetFigures {
 
 fn bench_with(dataset: &Path, config: Config) -> DatasetFigures {
     let store = tempfile::tempdir().unwrap();
-    let limits = Limits { threads: 2, memory: 4 << 30 };
-    let session = Session::open(store.path(), None, limits, Arc::new(AtomicBool::new(false))).unwrap();
+    let session = session(store.path());
     let options = BenchOptions { config, seed: 0, gps: BenchGps::None };
     bench_dataset(&session, dataset, &options).unwrap()
+}
+
+fn session(store: &Path) -> Session {
+    let limits = Limits { threads: 2, memory: 4 << 30 };
+    Session::open(store, None, limits, Arc::new(AtomicBool::new(false))).unwrap()
+}
+
+fn built(session: &Session, panoramas: &ImageFolder, config: &Config) -> Box<Built> {
+    match build_scene(session, panoramas, config, 0, "scene", None, |_| Ok(())).unwrap() {
+        BuildOutcome::Built(built) => built,
+        BuildOutcome::Unchanged(..) => panic!("no present hash was given"),
+    }
 }
 
 /// Scene whole and right; the target fails alone and is found by its set.
@@ -67,20 +78,14 @@ fn the_town_is_mapped_and_its_set_located() {
 fn a_set_of_unknown_intrinsics_is_located_and_tells_them() {
     let folder = tempfile::tempdir().unwrap();
     stages::write_sample(folder.path()).unwrap();
-    let limits = Limits { threads: 2, memory: 4 << 30 };
-    let store = folder.path().join("store");
-    let session = Session::open(&store, None, limits, Arc::new(AtomicBool::new(false))).unwrap();
+    let session = session(&folder.path().join("store"));
     let read = |part: &str, cameras: &CameraBook| {
         let files = list_images(&[folder.path().join(part)]).unwrap();
         ImageFolder::read(&files, cameras, &GeoSource::None, None).unwrap()
     };
     let config = Config::default();
     let panoramas = read("panoramas", &CameraBook::default());
-    let BuildOutcome::Built(built) =
-        build_scene(&session, &panoramas, &config, 0, "scene", None, |_| Ok(())).unwrap()
-    else {
-        panic!("no present hash was given")
-    };
+    let built = built(&session, &panoramas, &config);
     let what = LocateJobs { scene: Arc::clone(&built.scene), config, seed: 0 };
     let known = CameraBook::read(&folder.path().join("cameras.json")).unwrap();
     let mut by_cameras = [read("queries/lane", &known), read("queries/lane", &CameraBook::default())];
@@ -110,9 +115,7 @@ fn a_set_of_unknown_intrinsics_is_located_and_tells_them() {
 fn photos_localized_earlier_localize_one_that_the_panoramas_do_not() {
     let folder = tempfile::tempdir().unwrap();
     stages::write_sample(folder.path()).unwrap();
-    let limits = Limits { threads: 2, memory: 4 << 30 };
-    let store = folder.path().join("store");
-    let session = Session::open(&store, None, limits, Arc::new(AtomicBool::new(false))).unwrap();
+    let session = session(&folder.path().join("store"));
     let cameras = CameraBook::read(&folder.path().join("cameras.json")).unwrap();
     let read = |part: &str| {
         let files = list_images(&[folder.path().join(part)]).unwrap();
@@ -120,11 +123,7 @@ fn photos_localized_earlier_localize_one_that_the_panoramas_do_not() {
     };
     let config = Config::default();
     let panoramas = read("panoramas");
-    let BuildOutcome::Built(built) =
-        build_scene(&session, &panoramas, &config, 0, "scene", None, |_| Ok(())).unwrap()
-    else {
-        panic!("no present hash was given")
-    };
+    let built = built(&session, &panoramas, &config);
     let mut bridging = read("queries/lane");
     // The last one stands too far on for those before it, too.
     bridging.images.pop();

@@ -83,13 +83,14 @@ struct FreeIntrinsics {
 
 impl FreeIntrinsics {
     fn new(index: usize, camera: &Camera, parameters: Vec<usize>) -> Self {
-        let moved = parameters.iter().map(|&parameter| MovedCamera::new(camera, parameter)).collect();
-        Self { camera: index as u32, parameters, moved }
+        let mut free = Self { camera: index as u32, parameters, moved: Vec::new() };
+        free.refresh(camera);
+        free
     }
 
     fn refresh(&mut self, camera: &Camera) {
-        let Self { parameters, moved, .. } = self;
-        *moved = parameters.iter().map(|&parameter| MovedCamera::new(camera, parameter)).collect();
+        let moved = |&parameter: &usize| MovedCamera::new(camera, parameter);
+        self.moved = self.parameters.iter().map(moved).collect();
     }
 }
 
