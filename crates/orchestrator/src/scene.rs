@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use setloc_camset::GrownImage;
 use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::{ImageId, Reconstruction};
+use setloc_sfm::{ImageId, Reconstruction, Rigid};
 
 use crate::codec::{self, Artifact};
 use crate::error::Hinted;
@@ -90,6 +90,17 @@ impl SceneFile {
         component == 0 || (self.is_placed(0) && self.is_placed(component))
     }
 
+    /// Names and poses of the images in the frame of `origin`, by name: those of all components that measured positions
+    /// place.
+    pub fn placed_poses(&self) -> Vec<(String, Rigid)> {
+        let placed = self.components.iter().enumerate().filter(|(at, _)| self.is_placed(*at));
+        let poses = placed.flat_map(|(_, component)| &component.images);
+        let mut poses: Vec<_> =
+            poses.filter_map(|image| Some((image.name.clone(), image.world_from_camera?))).collect();
+        poses.sort_by(|(a, _), (b, _)| a.cmp(b));
+        poses
+    }
+
     /// Names of the images that no component has a pose of.
     pub fn unregistered(&self) -> Vec<&str> {
         let images = self.main().map_or(&[][..], |main| &main.images);
@@ -109,6 +120,8 @@ impl SceneFile {
 
 #[cfg(test)]
 mod tests {
+    use setloc_sfm::{CameraId, ReconstructionImage};
+
     use super::*;
 
     #[test]
@@ -124,6 +137,29 @@ mod tests {
         assert_eq!([0, 1, 2, 3].map(|component| read.shares_frame(component)), [true, false, true, false]);
         let own = SceneFile { placed: vec![false, false, true], ..scene };
         assert_eq!([0, 1, 2].map(|component| own.shares_frame(component)), [true, false, false]);
+    }
+
+    #[test]
+    fn poses_on_the_map_are_of_all_components_that_are_placed_there() {
+        let component = |registered: usize| Reconstruction {
+            images: ["c", "b", "a"]
+                .iter()
+                .enumerate()
+                .map(|(at, name)| ReconstructionImage {
+                    name: (*name).to_owned(),
+                    camera: CameraId(0),
+                    world_from_camera: (at == registered).then(Rigid::identity),
+                })
+                .collect(),
+            ..Reconstruction::default()
+        };
+        let scene = SceneFile {
+            components: (0..3).map(component).collect(),
+            placed: vec![true, false, true],
+            ..SceneFile::default()
+        };
+        let names: Vec<String> = scene.placed_poses().into_iter().map(|(name, _)| name).collect();
+        assert_eq!(names, ["a", "c"]);
     }
 
     #[test]

@@ -362,8 +362,11 @@ pub fn remove_leftovers(folder: &Path) {
     }
 }
 
-/// Removes a file; that another process did it before is no error.
-fn remove(path: &Path) -> Result<()> {
+/// Removes a file; that it is not there is no error.
+///
+/// # Errors
+/// When it is there and cannot be removed.
+pub fn remove(path: &Path) -> Result<()> {
     match fs::remove_file(path) {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(write_error(error, path)),
         _ => Ok(()),

@@ -74,6 +74,24 @@ fn photos_of_either_town_are_localized_in_its_component_and_say_so() {
 
     let build = run(&[&["build", "both/panoramas", "-o", "s.setloc"], &cameras[..]].concat());
     assert!(said(&build).contains("in it in a frame of its own: panoramas/b_pano_"), "{}", said(&build));
+    assert!(said(&build).contains("the other components are in s/component_2"), "{}", said(&build));
+    let images = |model: &str| std::fs::read_to_string(folder.path().join(model).join("images.txt")).unwrap();
+    let (first, second) = (images("s/colmap"), images("s/component_2/colmap"));
+    assert!(first.contains(" panoramas/a_pano_000.jpg\n") && !first.contains("b_pano_"), "{first}");
+    assert!(second.contains(" panoramas/b_pano_000.jpg\n") && !second.contains("a_pano_"), "{second}");
+    let points = std::fs::read_to_string(folder.path().join("s/component_2/colmap/points3D.txt")).unwrap();
+    let elements = points.lines().nth(1).unwrap().split(' ').count();
+    assert!(elements >= 8 + 4, "id, place, color, error, and a track of two images: {elements}");
+    assert!(folder.path().join("s/component_2/points.ply").exists());
+    let export = |number: &str| {
+        let arguments = ["export", "s.setloc", "--format", "colmap", "-o", number, "--component", number];
+        setloc(folder.path(), &arguments)
+    };
+    assert_eq!(export("2").status.code(), Some(0));
+    assert!(images("2").contains(" panoramas/b_pano_000.jpg\n") && !images("2").contains("a_pano_"));
+    let beyond = export("3");
+    assert_eq!(beyond.status.code(), Some(2));
+    assert!(said(&beyond).contains("the scene has no component 3"), "{}", said(&beyond));
     let locate = |scene: &str, more: &[&str]| {
         let arguments = ["locate", scene, "both/queries/a", "both/queries/b", "-o", "out"];
         run(&[&arguments, &cameras[..], more].concat())
@@ -108,8 +126,20 @@ fn photos_of_either_town_are_localized_in_its_component_and_say_so() {
     let build = ["build", "both/panoramas", "-o", "p.setloc", "--gps", "geo.csv"];
     let build = run(&[&build, &cameras[..]].concat());
     assert!(said(&build).contains("beside which measured positions alone place it"), "{}", said(&build));
+    let map = gave(&setloc(folder.path(), &["export", "p.setloc", "--format", "geojson"]));
+    let map: Value = serde_json::from_str(&map).unwrap();
+    let on_map: Vec<&str> =
+        map["features"].as_array().unwrap().iter().filter_map(|f| f["properties"]["name"].as_str()).collect();
+    assert!(on_map.contains(&"panoramas/a_pano_000.jpg") || on_map.contains(&"a_pano_000.jpg"), "{on_map:?}");
+    assert!(on_map.iter().any(|name| name.ends_with("b_pano_000.jpg")), "{on_map:?}");
     let found = locate("p.setloc", &target);
     let text = gave(&found);
     assert_eq!(fields(&text, "b/img_00.jpg\t")[1], "localized", "{text}");
     assert!(!text.contains("its frame is its own"), "{text}");
+
+    // A scene of one component has no exports of a second, nor those of the scene before.
+    let build = run(&["build", "a/panoramas", "-o", "s.setloc", "--cameras", "a/cameras.json"]);
+    assert_eq!(build.status.code(), Some(0), "{}", said(&build));
+    assert!(folder.path().join("s/colmap/images.txt").exists());
+    assert!(!folder.path().join("s/component_2").exists());
 }

@@ -276,6 +276,9 @@ pub struct ExportArgs {
     /// The format
     #[arg(long, value_enum)]
     pub format: ExportFormat,
+    /// Which component, 1 being the largest; `json` has all, `geojson` and `kml` all that are placed on the map
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub component: usize,
     /// File, or folder for COLMAP [default: standard output]
     #[arg(short, long)]
     pub output: Option<PathBuf>,

@@ -14,14 +14,14 @@ use crate::building::{BuildOutcome, Built, alike_pairs, build_scene};
 use crate::config::Config;
 use crate::dataset::{ImageFolder, SkippedImage, list_images};
 use crate::error::Hinted;
-use crate::export::{Marker, colmap_lacks, ply, renew_colmap, scene_json, top_view_png};
+use crate::export::{Marker, colmap_lacks, ply, remove_colmap, renew_colmap, scene_json, top_view_png};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, Prediction};
 use crate::jobs::{LikelyJobs, add_scene};
 use crate::print;
 use crate::scene::SceneFile;
 use crate::session::{Session, cache_folder};
-use crate::store::{RunRecord, Store, write_atomically};
+use crate::store::{RunRecord, Store, remove, write_atomically};
 
 /// Blue, for cameras of the scene.
 pub const SCENE_COLOR: [u8; 3] = [30, 90, 220];
@@ -61,6 +61,12 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
             summarize(&built.scene, folder.images.len() + folder.skipped.len());
             if let Some(lack) = built.scene.main().and_then(colmap_lacks) {
                 print::note(&format!("warning: no COLMAP model is written: {lack}"));
+            }
+            if built.scene.components.len() > 1 {
+                print::note(&format!(
+                    "the other components are in {}/component_2 and so on",
+                    export.display()
+                ));
             }
             (&built.run, &built.skipped)
         }
@@ -191,26 +197,64 @@ pub fn scene_markers(model: &Reconstruction, grown: &BTreeSet<&str>) -> Vec<Mark
     model.registered().filter_map(marker).collect()
 }
 
-/// Poses, point cloud, COLMAP model and picture; with features by image name, the COLMAP model has the tracks.
+/// Poses, and of each component the point cloud, COLMAP model and picture: of the largest in the folder itself, of the
+/// second in its `component_2`, and so on. With features by image name, COLMAP models have the tracks.
 pub fn write_models(
     folder: &Path,
     scene: &SceneFile,
     features: &BTreeMap<String, Arc<ImageFeatures>>,
 ) -> Result<()> {
-    let model = &scene.main().map_or_else(Reconstruction::default, Reconstruction::by_name);
-    let markers = scene_markers(model, &scene.grown_names());
+    write_json(&folder.join("poses.json"), &scene_json(scene))?;
+    let grown = scene.grown_names();
+    let none = Reconstruction::default();
+    write_model(folder, scene.main().unwrap_or(&none), features, &grown)?;
+    for (at, component) in scene.components.iter().enumerate().skip(1) {
+        write_model(&component_folder(folder, at), component, features, &grown)?;
+    }
+    // An earlier scene may have had more of them.
+    let older = (scene.components.len().max(1)..).map(|at| component_folder(folder, at));
+    older.take_while(|folder| folder.is_dir()).try_for_each(|folder| remove_model(&folder))
+}
+
+/// Where the exports of a component beside the largest are; numbered from 1, as people are told them.
+fn component_folder(folder: &Path, at: usize) -> PathBuf {
+    folder.join(format!("component_{}", at + 1))
+}
+
+const POINT_CLOUD: &str = "points.ply";
+const PICTURE: &str = "top_view.png";
+const COLMAP_MODEL: &str = "colmap";
+
+fn write_model(
+    folder: &Path,
+    model: &Reconstruction,
+    features: &BTreeMap<String, Arc<ImageFeatures>>,
+    grown: &BTreeSet<&str>,
+) -> Result<()> {
+    let model = &model.by_name();
+    let markers = scene_markers(model, grown);
     let centres: Vec<_> =
         markers.iter().map(|marker| (marker.world_from_camera.translation, marker.color)).collect();
     let features: Vec<Option<&ImageFeatures>> =
         model.images.iter().map(|image| features.get(&image.name).map(|features| &**features)).collect();
-    let writers: [&(dyn Fn() -> Result<()> + Sync); 4] = [
+    let writers: [&(dyn Fn() -> Result<()> + Sync); 3] = [
         // What COLMAP lacks is said when the scene is.
-        &|| renew_colmap(&folder.join("colmap"), model, &features).map(drop),
-        &|| write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes()),
-        &|| write_json(&folder.join("poses.json"), &scene_json(scene)),
-        &|| write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?),
+        &|| renew_colmap(&folder.join(COLMAP_MODEL), model, &features).map(drop),
+        &|| write_atomically(&folder.join(POINT_CLOUD), ply(model, &centres).as_bytes()),
+        &|| write_atomically(&folder.join(PICTURE), &top_view_png(model, &markers)?),
     ];
     writers.into_par_iter().with_max_len(1).try_for_each(|write| write())
+}
+
+/// Removes what [`write_model`] wrote for an earlier scene, and the folder if nothing else is in it.
+fn remove_model(folder: &Path) -> Result<()> {
+    remove_colmap(&folder.join(COLMAP_MODEL))?;
+    for name in [POINT_CLOUD, PICTURE] {
+        remove(&folder.join(name))?;
+    }
+    // It stays where somebody else's files are in it.
+    let _ = std::fs::remove_dir(folder);
+    Ok(())
 }
 
 /// What the run cost and what is wrong with the scene, and with the images that it was given; written last.

@@ -1,5 +1,5 @@
 use anyhow::{Context, Result};
-use setloc_sfm::{Reconstruction, ReconstructionImage};
+use setloc_sfm::Reconstruction;
 
 use super::Answer;
 use super::args::{ExportArgs, ExportFormat};
@@ -13,12 +13,11 @@ use crate::store::write_atomically;
 /// `setloc export`
 pub fn run(args: &ExportArgs) -> Result<Answer> {
     let scene = SceneFile::read(&args.scene)?;
-    let model = &scene.main().map_or_else(Reconstruction::default, Reconstruction::by_name);
+    let component = component(&scene, args.component)?;
+    let model = &component.by_name();
     let needs_output =
         || Hinted::error("this format is not written to standard output", "name a file or folder with -o");
     let markers = scene_markers(model, &scene.grown_names());
-    let posed = |image: &ReconstructionImage| Some((image.name.clone(), image.world_from_camera?));
-    let poses = || model.images.iter().filter_map(posed).collect::<Vec<_>>();
     let text = match args.format {
         ExportFormat::Colmap => {
             let folder = args.output.as_deref().ok_or_else(needs_output)?;
@@ -42,8 +41,10 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
         }
         ExportFormat::Nerfstudio => serde_json::to_string_pretty(&nerfstudio(model)?)?,
         ExportFormat::Json => serde_json::to_string_pretty(&scene_json(&scene))?,
-        ExportFormat::Geojson => serde_json::to_string_pretty(&geojson(&poses(), scene.origin)?)?,
-        ExportFormat::Kml => kml(&poses(), scene.origin)?,
+        ExportFormat::Geojson => {
+            serde_json::to_string_pretty(&geojson(&scene.placed_poses(), scene.origin)?)?
+        }
+        ExportFormat::Kml => kml(&scene.placed_poses(), scene.origin)?,
     };
     match &args.output {
         Some(file) => {
@@ -53,4 +54,16 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
         None => print::data(text.trim_end()),
     }
     Ok(Answer::Done)
+}
+
+/// A component of the scene by its number, from 1 on; a scene without any has an empty first one.
+fn component(scene: &SceneFile, number: usize) -> Result<Reconstruction> {
+    match number.checked_sub(1).and_then(|at| scene.components.get(at)) {
+        Some(component) => Ok(component.clone()),
+        None if number == 1 => Ok(Reconstruction::default()),
+        None => Err(Hinted::error(
+            format!("the scene has no component {number}"),
+            format!("it has {}, counted from 1, the largest", scene.components.len()),
+        )),
+    }
 }

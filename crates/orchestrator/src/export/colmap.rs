@@ -1,6 +1,5 @@
 use std::collections::BTreeSet;
 use std::fmt::Write;
-use std::io::ErrorKind;
 use std::path::Path;
 
 use anyhow::Result;
@@ -9,7 +8,7 @@ use setloc_features::{ImageFeatures, Keypoint};
 use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage, ReconstructionPoint};
 
 use crate::error::Hinted;
-use crate::store::write_pieces_atomically;
+use crate::store::{remove, write_pieces_atomically};
 
 /// What a model consists of.
 const FILES: [&str; 3] = ["cameras.txt", "images.txt", "points3D.txt"];
@@ -137,19 +136,21 @@ pub fn renew_colmap(
         write_colmap(folder, model, features)?;
         return Ok(None);
     };
+    remove_colmap(folder)?;
+    Ok(Some(lack))
+}
+
+/// Removes the model of an earlier scene, and the folder if nothing else is in it.
+///
+/// # Errors
+/// When a file cannot be removed.
+pub fn remove_colmap(folder: &Path) -> Result<()> {
     for name in FILES {
-        let file = folder.join(name);
-        match std::fs::remove_file(&file) {
-            Err(error) if error.kind() != ErrorKind::NotFound => {
-                let what = format!("cannot remove {}, which is of an earlier scene", file.display());
-                return Err(anyhow::Error::new(error).context(what));
-            }
-            _ => {}
-        }
+        remove(&folder.join(name))?;
     }
     // It stays where somebody else's files are in it.
     let _ = std::fs::remove_dir(folder);
-    Ok(Some(lack))
+    Ok(())
 }
 
 #[cfg(test)]
