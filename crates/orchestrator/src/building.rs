@@ -5,15 +5,16 @@ use std::sync::Arc;
 
 use anyhow::Result;
 use rayon::prelude::*;
-use setloc_features::ImageFeatures;
+use setloc_features::{Calibration, Camera, ImageFeatures};
+use setloc_sfm::MapperOutput;
 
 use crate::artifacts::LikelyImages;
 use crate::config::Config;
-use crate::dataset::{ImageFolder, SkippedImage, SourceImage};
+use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Executor, JobGraph, RunResult};
-use crate::jobs::{LikelyJobs, SceneJobs, add_scene};
+use crate::jobs::{LikelyJobs, SceneJobs, SceneModelJobs, add_scene, add_scene_model};
 use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::stages::FeatureParams;
@@ -44,6 +45,9 @@ pub enum BuildOutcome {
 
 /// Builds a scene; with the hash that the output already has, an unchanged scene is not read.
 ///
+/// Where intrinsics are a guess, the images are mapped twice: the second time their pairs are verified, and the model is
+/// begun, with the cameras that the first model told.
+///
 /// `export` gets the scene while its last results are still being kept.
 ///
 /// # Errors
@@ -58,8 +62,11 @@ pub fn build_scene(
     export: impl FnOnce(&Built) -> Result<()>,
 ) -> Result<BuildOutcome> {
     let (alike, before) = alike_pairs(session, name, &folder.images, &config.features, config)?;
+    let (calibrated, first) = estimate_cameras(session, name, &folder.images, &alike, config, seed)?;
+    let before = before.and(first);
     let mut graph = JobGraph::default();
-    let jobs = add_scene(&mut graph, &folder.images, &alike, config, seed)?;
+    let images = calibrated.as_deref().unwrap_or(&folder.images);
+    let jobs = add_scene(&mut graph, images, &alike, config, seed)?;
     graph.want(jobs.scene);
     graph.want_file(jobs.scene);
     jobs.features.iter().for_each(|features| graph.want(*features));
@@ -96,6 +103,102 @@ pub fn alike_pairs(
             executor.output(jobs.likely).map(|_| executor.load::<LikelyImages>(jobs.likely)).transpose()?;
         Ok((found.map(|found| jobs.pairs(&found)).unwrap_or_default(), run.clone()))
     })
+}
+
+/// Whether a scene of these images is mapped twice.
+pub fn has_guessed_cameras(images: &[SourceImage]) -> bool {
+    images.iter().any(|image| image.calibration == Calibration::Guessed)
+}
+
+/// Adds the jobs of the model that tells guessed cameras.
+///
+/// # Errors
+/// When parameters have no JSON form.
+pub fn add_first_model(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    alike: &[(usize, usize)],
+    config: &Config,
+    seed: u64,
+) -> Result<SceneModelJobs> {
+    let mut config = config.clone();
+    // Cameras need no better points than those of the keypoints.
+    config.alignment.enabled = false;
+    let jobs = add_scene_model(graph, images, alike, &config, seed)?;
+    graph.want(jobs.model);
+    Ok(jobs)
+}
+
+/// The images with the cameras that a first model tells in place of guessed ones, `None` when it tells none, and what that
+/// model took.
+///
+/// # Errors
+/// When the run was stopped or the store cannot be written.
+pub fn estimate_cameras(
+    session: &Session,
+    name: &str,
+    images: &[SourceImage],
+    alike: &[(usize, usize)],
+    config: &Config,
+    seed: u64,
+) -> Result<(Option<Vec<SourceImage>>, RunResult)> {
+    if !has_guessed_cameras(images) {
+        return Ok((None, RunResult::default()));
+    }
+    let mut graph = JobGraph::default();
+    let jobs = add_first_model(&mut graph, images, alike, config, seed)?;
+    session.run(name, &graph, |executor, run| {
+        let model = executor.output(jobs.model).map(|_| executor.load::<MapperOutput>(jobs.model));
+        let model = model.transpose()?;
+        Ok((model.and_then(|model| with_estimated_cameras(images, &jobs, &model)), run.clone()))
+    })
+}
+
+/// Fewer images of a camera tell it too poorly to replace a guess.
+const MIN_IMAGES: usize = 3;
+
+/// The images with the cameras of a model in place of guessed ones; `None` when it tells none.
+///
+/// Images of one guess have one camera: that of the component that has registered most of them.
+fn with_estimated_cameras(
+    images: &[SourceImage],
+    jobs: &SceneModelJobs,
+    model: &MapperOutput,
+) -> Option<Vec<SourceImage>> {
+    let mut told: Vec<(&Camera, usize, &Camera)> = Vec::new();
+    for component in &model.components {
+        let mut counts: Vec<(&Camera, usize, &Camera)> = Vec::new();
+        for id in component.registered() {
+            let given = jobs.image_given(&component.images[id.index()]).and_then(|at| images.get(at));
+            let Some(given) = given.filter(|image| image.calibration == Calibration::Guessed) else {
+                continue;
+            };
+            match counts.iter_mut().find(|(guess, ..)| **guess == given.camera) {
+                Some((_, count, _)) => *count += 1,
+                None => counts.push((&given.camera, 1, component.camera_of(id))),
+            }
+        }
+        for found in counts.into_iter().filter(|(_, count, _)| *count >= MIN_IMAGES) {
+            match told.iter_mut().find(|(guess, ..)| *guess == found.0) {
+                Some(best) if best.1 < found.1 => *best = found,
+                Some(_) => {}
+                None => told.push(found),
+            }
+        }
+    }
+    let image = |image: &SourceImage| {
+        let is_guess = |(guess, ..): &&(&Camera, usize, &Camera)| **guess == image.camera;
+        let camera = told.iter().find(is_guess).filter(|_| image.calibration == Calibration::Guessed);
+        camera.map_or_else(
+            || image.clone(),
+            |(.., camera)| SourceImage {
+                camera: (*camera).clone(),
+                camera_origin: CameraOrigin::Estimated,
+                ..image.clone()
+            },
+        )
+    };
+    (!told.is_empty()).then(|| images.iter().map(image).collect())
 }
 
 /// What the jobs came to; the scene is read unless it is `present`.

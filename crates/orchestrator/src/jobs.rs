@@ -13,7 +13,7 @@ pub use likely::LikelyJobs;
 pub use locate::{LocateJobs, SetJobs, add_set, add_singles};
 pub use model::{ModelJobs, ModelKind, add_features_of, add_model};
 pub use pairs::choose_pairs;
-pub use scene::{SceneJobs, add_scene};
+pub use scene::{SceneJobs, SceneModelJobs, add_scene, add_scene_model};
 
 use crate::fingerprint::ContentHash;
 

@@ -5,14 +5,16 @@ use std::sync::Arc;
 use anyhow::Result;
 use rayon::prelude::*;
 use serde_json::Value;
-use setloc_features::ImageFeatures;
-use setloc_sfm::Reconstruction;
+use setloc_features::{Calibration, Camera, ImageFeatures};
+use setloc_sfm::{ImageId, Reconstruction};
 
 use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
-use crate::building::{BuildOutcome, Built, alike_pairs, build_scene};
+use crate::building::{
+    BuildOutcome, Built, add_first_model, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras,
+};
 use crate::config::Config;
-use crate::dataset::{ImageFolder, SkippedImage, list_images};
+use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images};
 use crate::error::Hinted;
 use crate::export::{Marker, colmap_lacks, ply, remove_colmap, renew_colmap, scene_json, top_view_png};
 use crate::fingerprint::ContentHash;
@@ -59,6 +61,10 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
         BuildOutcome::Built(built) => {
             write_report(&export, (&built.scene, built.hash), &built.skipped, &folder.warnings, &session)?;
             summarize(&built.scene, folder.images.len() + folder.skipped.len());
+            told_by_scene(&folder, &built.scene)
+                .estimated_cameras()
+                .iter()
+                .for_each(|line| print::note(line));
             if let Some(lack) = built.scene.main().and_then(colmap_lacks) {
                 print::note(&format!("warning: no COLMAP model is written: {lack}"));
             }
@@ -90,8 +96,7 @@ pub fn plan(args: &PlanArgs) -> Result<Answer> {
     let store = Store::at(&cache_folder(args.source.run.cache.as_deref(), &args.source.output));
     let name = store.name_of("build", &args.source.output);
     let alike = stored_alike_pairs(args, &folder, &config, (&store, &name))?;
-    let mut graph = JobGraph::default();
-    add_scene(&mut graph, &folder.images, &alike, &config, args.source.run.seed)?;
+    let graph = next_jobs(args, &folder, &alike, &config, (&store, &name))?;
     if args.format == PlanFormat::Dot {
         print::data(graph.to_dot().trim_end());
         return Ok(Answer::Done);
@@ -136,6 +141,34 @@ fn stored_alike_pairs(
     }
     let session = args.source.run.session(&args.source.output, None)?;
     Ok(alike_pairs(&session, name, &folder.images, &config.features, config)?.0)
+}
+
+/// The jobs of the scene; where its cameras are a guess, those of the model that tells them as long as some of these are not
+/// stored.
+fn next_jobs<'g>(
+    args: &PlanArgs,
+    folder: &ImageFolder,
+    alike: &[(usize, usize)],
+    config: &Config,
+    (store, name): (&Store, &str),
+) -> Result<JobGraph<'g>> {
+    let seed = args.source.run.seed;
+    let mut graph = JobGraph::default();
+    if !has_guessed_cameras(&folder.images) {
+        add_scene(&mut graph, &folder.images, alike, config, seed)?;
+        return Ok(graph);
+    }
+    add_first_model(&mut graph, &folder.images, alike, config, seed)?;
+    let planned = graph.plan(store, &RunRecord::default());
+    if planned.iter().any(|job| job.prediction != Prediction::Stored) {
+        print::note("cameras are estimated by a first model, and what follows from them is not listed");
+        return Ok(graph);
+    }
+    let session = args.source.run.session(&args.source.output, None)?;
+    let (told, _) = estimate_cameras(&session, name, &folder.images, alike, config, seed)?;
+    let mut graph = JobGraph::default();
+    add_scene(&mut graph, told.as_deref().unwrap_or(&folder.images), alike, config, seed)?;
+    Ok(graph)
 }
 
 /// What is exported beside images would be read as images by the next build.
@@ -188,13 +221,28 @@ pub fn export_folder(output: &Path) -> PathBuf {
 
 /// Blue markers for the registered images of a model, green ones for those of the names `grown`.
 pub fn scene_markers(model: &Reconstruction, grown: &BTreeSet<&str>) -> Vec<Marker> {
-    let marker = |id: setloc_sfm::ImageId| {
+    let marker = |id: ImageId| {
         let directed = !model.camera_of(id).is_panoramic();
         let image = &model.images[id.index()];
         let color = if grown.contains(image.name.as_str()) { GROWN_COLOR } else { SCENE_COLOR };
         image.world_from_camera.map(|world_from_camera| Marker { world_from_camera, color, directed })
     };
     model.registered().filter_map(marker).collect()
+}
+
+/// The images of guessed cameras that the scene has registered, with the cameras that it has of them.
+fn told_by_scene(folder: &ImageFolder, scene: &SceneFile) -> ImageFolder {
+    let registered = |component: &Reconstruction, id: ImageId| {
+        (component.images[id.index()].name.clone(), component.camera_of(id).clone())
+    };
+    let told: BTreeMap<String, Camera> = (scene.components.iter())
+        .flat_map(|component| component.registered().map(|id| registered(component, id)))
+        .collect();
+    let image = |image: &SourceImage| {
+        let camera = told.get(&image.name).filter(|_| image.calibration == Calibration::Guessed)?.clone();
+        Some(SourceImage { camera, camera_origin: CameraOrigin::Estimated, ..image.clone() })
+    };
+    ImageFolder { images: folder.images.iter().filter_map(image).collect(), ..ImageFolder::default() }
 }
 
 /// Poses, and of each component the point cloud, COLMAP model and picture: of the largest in the folder itself, of the

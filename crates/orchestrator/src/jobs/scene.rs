@@ -5,10 +5,12 @@ use rayon::prelude::*;
 use serde_json::json;
 use setloc_features::{GeoPosition, ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::{ImageId, MapperOutput, MeasuredPosition, MergeRecord, Reconstruction};
+use setloc_sfm::{ImageId, MapperOutput, MeasuredPosition, MergeRecord, Reconstruction, ReconstructionImage};
 
 use super::choose_pairs;
-use super::model::{ModelKind, ModelSource, add_model, features_role, image_of_place_holder, with_names};
+use super::model::{
+    ModelJobs, ModelKind, ModelSource, add_model, features_role, image_of_place_holder, with_names,
+};
 use crate::artifacts::SceneIndices;
 use crate::codec::Artifact;
 use crate::config::Config;
@@ -29,17 +31,38 @@ pub struct SceneJobs {
     pub scene: JobId,
 }
 
-/// Adds all jobs from image files to a scene file; `alike` are pairs of images that look alike.
-///
-/// # Errors
-/// When parameters have no JSON form.
-pub fn add_scene(
+/// The jobs of a scene's model alone.
+#[derive(Debug, Clone)]
+pub struct SceneModelJobs {
+    /// The job whose result the model is.
+    pub model: JobId,
+    /// The model's images, in its order, as places in the list of the images given.
+    order: Vec<usize>,
+}
+
+impl SceneModelJobs {
+    /// Which of the images given an image of the model is.
+    pub fn image_given(&self, image: &ReconstructionImage) -> Option<usize> {
+        self.order.get(image_of_place_holder(&image.name)?).copied()
+    }
+}
+
+/// A model whose images are in the order of their content.
+struct OrderedModel {
+    jobs: ModelJobs,
+    images: Vec<SourceImage>,
+    /// Where these are in the list of the images given.
+    order: Vec<usize>,
+    origin: Option<Wgs84>,
+}
+
+fn add_ordered_model(
     graph: &mut JobGraph<'_>,
     images: &[SourceImage],
     alike: &[(usize, usize)],
     config: &Config,
     seed: u64,
-) -> Result<SceneJobs> {
+) -> Result<OrderedModel> {
     let origin = origin_of(images);
     let position = |image: &SourceImage| {
         let (place, origin) = (image.position?, origin?);
@@ -52,6 +75,36 @@ pub fn add_scene(
     let positions: Vec<Option<MeasuredPosition>> = order.iter().map(|&at| listed[at]).collect();
     let source = ModelSource { images: &images, positions: &positions, pairs: &pairs };
     let jobs = add_model(graph, ModelKind::Scene, "scene", source, config, seed)?;
+    Ok(OrderedModel { jobs, images, order, origin })
+}
+
+/// Adds all jobs from image files to a scene's model; `alike` are pairs of images that look alike.
+///
+/// # Errors
+/// When parameters have no JSON form.
+pub fn add_scene_model(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    alike: &[(usize, usize)],
+    config: &Config,
+    seed: u64,
+) -> Result<SceneModelJobs> {
+    let OrderedModel { jobs, order, .. } = add_ordered_model(graph, images, alike, config, seed)?;
+    Ok(SceneModelJobs { model: jobs.model, order })
+}
+
+/// Adds all jobs from image files to a scene file; `alike` are pairs of images that look alike.
+///
+/// # Errors
+/// When parameters have no JSON form.
+pub fn add_scene(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    alike: &[(usize, usize)],
+    config: &Config,
+    seed: u64,
+) -> Result<SceneJobs> {
+    let OrderedModel { jobs, images, order, origin } = add_ordered_model(graph, images, alike, config, seed)?;
     let index_params = config.index.clone();
     let index_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
