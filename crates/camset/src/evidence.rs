@@ -171,6 +171,17 @@ fn log10_binomial(n: usize, k: usize) -> f64 {
     (1..=k.min(n - k)).map(|i| ((n - k.min(n - k) + i) as f64 / i as f64).log10()).sum()
 }
 
+/// log₁₀ of an upper bound of the chance that `count` or more of something are seen where `expected` are to be expected.
+///
+/// Chernoff's bound of a Poisson distribution's tail, e^(n − μ) (μ/n)ⁿ.
+pub(crate) fn log10_chance_of_more(count: usize, expected: f64) -> f64 {
+    let count = count as f64;
+    if !(count > expected) {
+        return 0.0;
+    }
+    (count - expected + count * (expected / count).ln()) / std::f64::consts::LN_10
+}
+
 /// Whether two poses are the same answer: within 5° and within a tenth of the distance to what they see.
 pub(crate) fn same_pose(a: &Rigid, b: &Rigid, depth: f64) -> bool {
     a.rotation.angle_to(&b.rotation) < 0.087 && (a.translation - b.translation).norm() < 0.1 * depth
@@ -214,5 +225,15 @@ mod tests {
         assert!(few > log10_false_alarms(300, 20, 3, 1e-4));
         assert!(log10_false_alarms(1000, 4, 3, 1e-4) > 0.0);
         assert!((log10_binomial(10, 3) - 120.0_f64.log10()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn more_than_expected_is_rare_and_fewer_is_not() {
+        // Of a Poisson distribution of mean 5 the tail from 20 on is 8.1e-8.
+        let bound = log10_chance_of_more(20, 5.0);
+        assert!(bound > -7.1 && bound < -5.0, "{bound}");
+        assert_eq!(log10_chance_of_more(4, 5.0), 0.0);
+        assert_eq!(log10_chance_of_more(0, 0.0), 0.0);
+        assert!(log10_chance_of_more(9, 8.0) > -0.1);
     }
 }

@@ -28,6 +28,7 @@ mod set;
 mod single;
 pub mod synthetic;
 mod types;
+mod underfoot;
 mod verdict;
 mod views;
 
@@ -54,8 +55,8 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 15: only matches hundreds of deviations off are no noise. 16: what points do not localize is matched with the scene's
 /// images. 17, 18: by fewer matches a pair, all photos alike. 19: contradictions are named, advice goes with the answers.
 /// 20: all components of a scene are searched. 21: matches that tell no distance are named. 22: intrinsics that are not
-/// known are free under what holds for usual photos.
-pub const VERSION: u32 = 22;
+/// known are free under what holds for usual photos. 23: what lies on the ground alone localizes nothing.
+pub const VERSION: u32 = 23;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

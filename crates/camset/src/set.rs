@@ -394,6 +394,28 @@ mod tests {
         assert!(target.links.len() > 2 && target.weakest().is_some_and(|link| link.shared >= 12));
     }
 
+    #[test]
+    fn the_ground_alone_localizes_neither_photo_nor_set() {
+        let alone = |world: &World| {
+            let photo = locate_single(&SingleParams::default(), &world.scene(), &world.queries()[0], 7).photo;
+            (photo.verdict, photo.reasons.join("; "))
+        };
+        for standing in [0.0, 0.2] {
+            let world = World::chain_in(&Place::street(3500, 1).paved(standing, 2), 6, 0.2, 1);
+            let found = locate(&world, &CamsetParams::default());
+            let (center, rotation) = worst_errors(&world, &found.refined);
+            assert!(center < 0.2 && rotation < 0.3, "{center} {rotation}");
+            let localized = found.refined.iter().filter(|photo| photo.verdict == Verdict::Localized).count();
+            let (verdict, reasons) = alone(&world);
+            if standing > 0.0 {
+                assert_eq!((localized, verdict), (6, Verdict::Localized), "{reasons}");
+            } else {
+                assert_eq!((localized, verdict), (0, Verdict::Uncertain), "{reasons}");
+                assert!(reasons.contains("lie on the ground"), "{reasons}");
+            }
+        }
+    }
+
     /// A set whose scene has no point that any of its photos shows.
     fn locate_by_views(panoramas: &[u32], seed: u64) -> (World, SetLocalization) {
         locate_by_views_with(&CamsetParams::default(), panoramas, seed)

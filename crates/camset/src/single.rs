@@ -9,6 +9,7 @@ use setloc_sfm::{ImageId, Rigid};
 use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
 use crate::guided::guided_matches;
 use crate::refine::{JointModel, JointObservations, JointPhoto, refine_jointly};
+use crate::underfoot::Underfoot;
 use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
 use crate::{PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, SingleParams, Verdict};
 
@@ -128,6 +129,10 @@ fn solve(
     let rest: Vec<SceneMatch> = matches.iter().copied().filter(|m| !agreeing.contains(m)).collect();
     let runner_up = runner_up(params, scene.index, &rays, &rest, &pose, depth, seed);
     let chance = chance_of_inlier(&rays, scene.index, &pose, &agreeing, params.max_error_sigmas);
+    let seen: Vec<(Vector3<f64>, Vector3<f64>)> =
+        agreeing.iter().map(|m| (pose.translation, scene.index.position(m.point))).collect();
+    let off_ground =
+        Underfoot::of_scene(scene).map_or(seen.len(), |underfoot| underfoot.count_elsewhere(&seen));
     let evidence = Evidence {
         matches: matches.len(),
         inliers: agreeing.len(),
@@ -135,6 +140,7 @@ fn solve(
         log10_false_alarms: log10_false_alarms(matches.len(), agreeing.len(), SAMPLE, chance),
         cells: occupied_cells(&rays, agreeing.iter().map(|m| m.feature)),
         runner_up,
+        off_ground,
     };
     if agreeing.len() < params.verdict.min_inliers {
         return Some(SinglePose {

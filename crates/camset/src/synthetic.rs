@@ -59,6 +59,18 @@ impl Place {
         Self { positions, descriptors }
     }
 
+    /// The same place as paving: all points on the ground between the walls, but those of this share.
+    pub fn paved(mut self, standing: f64, seed: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        for position in &mut self.positions {
+            if !rng.random_bool(standing) {
+                position.y = rng.random_range(0.0..0.03);
+                position.x = rng.random_range(-7.0..7.0);
+            }
+        }
+        self
+    }
+
     /// Another place of the same details: every point looks like some point of this place, at random.
     pub fn shuffled(mut self, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);

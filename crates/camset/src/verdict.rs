@@ -19,7 +19,12 @@ pub(crate) struct Evidence {
     pub cells: usize,
     /// Support of the best pose that is distinct from this one.
     pub runner_up: usize,
+    /// How many of the inliers lie elsewhere than on the ground.
+    pub off_ground: usize,
 }
+
+/// Fewest inliers elsewhere than on the ground: three give a pose, one more would contradict a wrong one.
+const MIN_OFF_GROUND: usize = 4;
 
 /// Decides on the evidence for a pose alone: is it the right one?
 pub(crate) fn judge_support(
@@ -27,7 +32,7 @@ pub(crate) fn judge_support(
     evidence: &Evidence,
     reasons: &mut Vec<String>,
 ) -> Verdict {
-    let Evidence { matches, inliers, log10_false_alarms, cells, runner_up, .. } = *evidence;
+    let Evidence { matches, inliers, log10_false_alarms, cells, runner_up, off_ground, .. } = *evidence;
     reasons.push(format!("{inliers} of {matches} matches to the scene agree on the pose"));
     if inliers < params.min_inliers {
         reasons.push(format!("a pose needs at least {} agreeing matches", params.min_inliers));
@@ -48,6 +53,9 @@ pub(crate) fn judge_support(
     }
     if runner_up as f64 > params.max_runner_up * inliers as f64 && runner_up >= params.min_inliers / 2 {
         doubt(format!("another pose is supported by {runner_up} matches (repeated structure?)"));
+    }
+    if off_ground < MIN_OFF_GROUND {
+        doubt(format!("all but {off_ground} of them lie on the ground, which may repeat itself"));
     }
     verdict
 }
@@ -106,7 +114,15 @@ mod tests {
     use super::*;
 
     fn good() -> Evidence {
-        Evidence { matches: 100, inliers: 40, sample: 3, log10_false_alarms: -60.0, cells: 20, runner_up: 4 }
+        Evidence {
+            matches: 100,
+            inliers: 40,
+            sample: 3,
+            log10_false_alarms: -60.0,
+            cells: 20,
+            runner_up: 4,
+            off_ground: 30,
+        }
     }
 
     fn judge(evidence: &Evidence) -> Verdict {
@@ -121,6 +137,7 @@ mod tests {
         assert_eq!(judge(&Evidence { log10_false_alarms: f64::NAN, ..good() }), Verdict::Uncertain);
         assert_eq!(judge(&Evidence { cells: 2, ..good() }), Verdict::Uncertain);
         assert_eq!(judge(&Evidence { runner_up: 30, ..good() }), Verdict::Uncertain);
+        assert_eq!(judge(&Evidence { off_ground: 3, ..good() }), Verdict::Uncertain);
     }
 
     #[test]

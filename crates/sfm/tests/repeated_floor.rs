@@ -1,9 +1,11 @@
 //! The mapper in a room whose floor repeats itself exactly.
 
+use std::ops::Range;
+
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{Camera, ImageFeatures, Keypoint, Match};
+use setloc_features::{Camera, CameraModel, ImageFeatures, Keypoint, Match};
 use setloc_sfm::{
     CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, PairGeometry, PutativePair,
     Rigid, Similarity, TwoViewParams, reconstruct, verify_pair,
@@ -47,34 +49,63 @@ struct Room {
 impl Room {
     /// Seven panoramas 1 m apart along a room of 9 m × 5 m, 1.5 m above a tiled floor.
     fn new() -> Self {
+        let wall = |rng: &mut ChaCha8Rng| {
+            let (along, height) = (rng.random_range(-1.5..7.5), rng.random_range(-1.0..-0.1));
+            let side = if rng.random_bool(0.5) { 2.5 } else { -2.5 };
+            Vector3::new(side, height, along)
+        };
+        let pose = |k: usize, rng: &mut ChaCha8Rng| {
+            let center = Vector3::new(rng.random_range(-0.4..0.4), rng.random_range(-0.05..0.05), k as f64);
+            Rigid::new(UnitQuaternion::from_euler_angles(0.0, rng.random_range(-3.1..3.1), 0.0), center)
+        };
+        Self::seen_from(Camera::equirectangular(2048, 1024), wall, pose, (-3..11, 2.4))
+    }
+
+    /// Seven photos 1 m apart that look ahead along a tiled street between two walls.
+    fn street_of_photos() -> Self {
+        let wall = |rng: &mut ChaCha8Rng| {
+            let (along, height) = (rng.random_range(6.0..24.0), rng.random_range(-6.0..-0.3));
+            let side = if rng.random_bool(0.5) { 4.0 } else { -4.0 };
+            Vector3::new(side, height, along)
+        };
+        let pose = |k: usize, rng: &mut ChaCha8Rng| {
+            let center = Vector3::new(rng.random_range(-0.4..0.4), rng.random_range(-0.05..0.05), k as f64);
+            Rigid::new(UnitQuaternion::from_euler_angles(0.0, rng.random_range(-0.05..0.05), 0.0), center)
+        };
+        let params = vec![1100.0, 1100.0, 800.0, 600.0];
+        let camera = Camera { model: CameraModel::Pinhole, width: 1600, height: 1200, params };
+        Self::seen_from(camera, wall, pose, (-3..20, 9.0))
+    }
+
+    /// Points of walls and a floor with rows of tiles, of which each image sees what is within reach.
+    fn seen_from(
+        camera: Camera,
+        wall: impl Fn(&mut ChaCha8Rng) -> Vector3<f64>,
+        pose: impl Fn(usize, &mut ChaCha8Rng) -> Rigid,
+        (rows, reach): (Range<i32>, f64),
+    ) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let mut points: Vec<(Seen, Vector3<f64>)> = (0..WALL_POINTS)
-            .map(|at| {
-                let (along, height) = (rng.random_range(-1.5..7.5), rng.random_range(-1.0..-0.1));
-                let side = if rng.random_bool(0.5) { 2.5 } else { -2.5 };
-                (Seen::Wall(at), Vector3::new(side, height, along))
-            })
-            .collect();
+        let mut points: Vec<(Seen, Vector3<f64>)> =
+            (0..WALL_POINTS).map(|at| (Seen::Wall(at), wall(&mut rng))).collect();
         let spots: Vec<[f64; 2]> = (0..SPOTS).map(|_| [rng.random(), rng.random()]).collect();
-        for (x, z) in (-4..4).flat_map(|x| (-3..11).map(move |z| (x, z))) {
+        for (x, z) in (-4..4).flat_map(|x| rows.clone().map(move |z| (x, z))) {
             for (spot, at) in spots.iter().enumerate() {
                 let [x_m, z_m] = [f64::from(x) + at[0], f64::from(z) + at[1]].map(|tiles| tiles * TILE_M);
                 points.push((Seen::Floor { tile: [x, z], spot }, Vector3::new(x_m, 1.5, z_m)));
             }
         }
-        let camera = Camera::equirectangular(2048, 1024);
+        let (width, height) = (camera.width, camera.height);
         let mut room = Self { truth: vec![], camera, features: vec![], seen: vec![] };
         for k in 0..7 {
-            let center =
-                Vector3::new(rng.random_range(-0.4..0.4), rng.random_range(-0.05..0.05), f64::from(k));
-            let pose =
-                Rigid::new(UnitQuaternion::from_euler_angles(0.0, rng.random_range(-3.1..3.1), 0.0), center);
-            let mut features = ImageFeatures { width: 2048, height: 1024, ..ImageFeatures::default() };
+            let pose = pose(k, &mut rng);
+            let mut features = ImageFeatures { width, height, ..ImageFeatures::default() };
             let mut seen = Vec::new();
             for (what, point) in &points {
-                let is_near = matches!(what, Seen::Wall(_)) || (point - center).norm() < 2.4;
+                let is_near = matches!(what, Seen::Wall(_)) || (point - pose.translation).norm() < reach;
                 let pixel = room.camera.project(&pose.inverse_transform_point(point));
-                let Some(pixel) = pixel.filter(|_| is_near) else { continue };
+                let Some(pixel) = pixel.filter(|pixel| is_near && room.camera.contains(pixel)) else {
+                    continue;
+                };
                 let [x, y] = [pixel.x, pixel.y].map(|at| (at + rng.random_range(-0.5..0.5)) as f32);
                 features.keypoints.push(Keypoint { x, y, size: 5.0, orientation: 0.0, noise_px: 0.5 });
                 features.colors.push([128; 3]);
@@ -173,6 +204,20 @@ fn a_floor_of_equal_tiles_does_not_fold_the_room() {
     assert!(says_so(&output, "underfoot only"));
     let (lost, error) = room.judge(&output);
     assert!(lost.is_empty() && error < 0.03, "{lost:?}, {error} m");
+}
+
+#[test]
+fn paving_of_equal_tiles_does_not_fold_a_set_of_photos() {
+    let street = Room::street_of_photos();
+    let output = street.map(&MOSTLY_FLOOR);
+    assert!(says_so(&output, "underfoot only"), "{:?}", output.report.warnings);
+    let (lost, error) = street.judge(&output);
+    assert!(lost.is_empty() && error < 0.05, "{lost:?}, {error} m");
+
+    let output = street.map(&Matching { are_tiles_alike: false, ..MOSTLY_FLOOR });
+    assert!(!says_so(&output, "underfoot"), "{:?}", output.report.warnings);
+    let (lost, error) = street.judge(&output);
+    assert!(lost.is_empty() && error < 0.05, "{lost:?}, {error} m");
 }
 
 #[test]

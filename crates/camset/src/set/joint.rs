@@ -11,12 +11,15 @@ use super::called;
 use super::correspondences::{SetCorrespondence, correspondences, set_rays};
 use super::rigid::{RigidPose, SetPhotos, rigid_pose};
 use super::sights::{SetView, Sights};
-use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
+use crate::evidence::{
+    PhotoRays, chance_of_inlier, log10_chance_of_more, log10_false_alarms, median, occupied_cells, same_pose,
+};
 use crate::guided::guided_matches;
 use crate::refine::{
     JointModel, JointObservations, JointPhoto, SceneView, Sighting, TiedPoint, refine_jointly,
 };
 use crate::single::{inliers, union};
+use crate::underfoot::Underfoot;
 use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
 use crate::{
     CamsetParams, GuidedParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization,
@@ -32,6 +35,12 @@ const MIN_KEPT: f64 = 0.5;
 
 /// Fewest matches seen from elsewhere than the rest that give a set its scale at all.
 const MIN_FOR_SCALE: usize = 3;
+
+/// Scales at which a set is tried to see what it shows by chance; nearer ones show some of what the right one does.
+const OTHER_SCALES: [f64; 10] = [0.15, 0.25, 0.35, 0.5, 0.6, 1.6, 2.0, 2.8, 4.0, 6.0];
+
+/// Largest log₁₀ of the chance of showing as much at a wrong scale: a hundred may have been tried to find this one.
+const MAX_LOG10_CHANCE: f64 = -4.0;
 
 /// What became of one local model.
 pub(crate) enum ComponentAnswer {
@@ -243,7 +252,10 @@ impl Component<'_> {
             .max(sights.seen_from_elsewhere(&rigid.sights, &rigid.lone));
         // One standpoint's matches place that standpoint; a few chance matches of the others then fit some scale.
         let has_scale = self.members.len() > 1;
-        if has_scale && elsewhere < params.verdict.min_inliers / 2 {
+        if has_scale
+            && elsewhere < params.verdict.min_inliers / 2
+            && !self.scale_stands_out(&joint, &rays, &set_from_camera, &rigid)
+        {
             reasons.push(format!("its scale rests on {elsewhere} matches seen from elsewhere than the rest"));
             support = weaker(support, Verdict::Uncertain);
         }
@@ -462,7 +474,37 @@ impl Component<'_> {
             log10_false_alarms: by_rays.min(by_sights).min(by_lone),
             cells,
             runner_up: rigid.runner_up,
+            off_ground: self.off_ground(rays, set_from_camera, candidates, sights, rigid),
         }
+    }
+
+    /// How many of the matches, sights and lone rays that agree with a pose are elsewhere than on the ground.
+    fn off_ground(
+        &self,
+        rays: &[PhotoRays<'_>],
+        set_from_camera: &[Rigid],
+        candidates: &[SetCorrespondence],
+        sights: &Sights,
+        rigid: &RigidPose,
+    ) -> usize {
+        let Some(underfoot) = Underfoot::of_scene(self.scene) else { return usize::MAX };
+        let pose = |slot: usize| rigid.world_from_set.transform_pose(&set_from_camera[slot]);
+        let matched = rigid.agreeing.iter().filter_map(|&number| {
+            let found = &candidates[number];
+            let (slot, _) = *found.seen_by.first()?;
+            Some((pose(slot).translation, self.scene.index.position(found.scene)))
+        });
+        let sighted = rigid.sights.iter().filter_map(|&at| {
+            let (slot, _) = *sights.all[at].photos.first()?;
+            Some((pose(slot).translation, rigid.world_from_set.transform_point(&sights.position(at))))
+        });
+        let seen: Vec<(Vector3<f64>, Vector3<f64>)> = matched.chain(sighted).collect();
+        let is_above = |&&at: &&usize| {
+            let lone = &sights.lone[at];
+            let bearing = &rays[lone.slot].rays.bearings[lone.feature as usize];
+            !underfoot.is_below_horizon(&pose(lone.slot), bearing)
+        };
+        underfoot.count_elsewhere(&seen) + rigid.lone.iter().filter(is_above).count()
     }
 
     /// log₁₀ of the expected number of random placements of the set that explain as many features as this one.
@@ -483,6 +525,35 @@ impl Component<'_> {
             chance += radius_share * count as f64;
         }
         log10_false_alarms(features, explained, 0, (chance / features.max(1) as f64).min(1.0))
+    }
+
+    /// Whether the photos away from the main standpoint show clearly more scene points than the rigid set does at other
+    /// scales about that standpoint.
+    ///
+    /// These other scales tell how many are shown by chance. Far points, which any scale shows, count there as well.
+    fn scale_stands_out(
+        &self,
+        joint: &Joint,
+        rays: &[PhotoRays<'_>],
+        set_from_camera: &[Rigid],
+        rigid: &RigidPose,
+    ) -> bool {
+        let poses: Vec<Rigid> =
+            set_from_camera.iter().map(|pose| rigid.world_from_set.transform_pose(pose)).collect();
+        let center = poses[joint.main_standpoint()].translation;
+        let away = joint.away_from_main();
+        let shown = |scale: f64| -> usize {
+            let count = |&slot: &usize| {
+                let place = center + (poses[slot].translation - center) * scale;
+                let pose = Rigid::new(poses[slot].rotation, place);
+                let nearest = &self.evidence[self.members[slot]].nearest;
+                guided_matches(&self.params.guided, self.scene.index, &rays[slot], nearest, &pose).len()
+            };
+            away.par_iter().with_max_len(1).map(count).sum()
+        };
+        let found = joint.seen_from_elsewhere();
+        let by_chance = OTHER_SCALES.iter().map(|&scale| shown(scale)).max().unwrap_or(0);
+        log10_chance_of_more(found, by_chance as f64 + 1.0) <= MAX_LOG10_CHANCE
     }
 
     /// The paper's T_OPT, in rounds: observations are chosen under the present poses, then all poses move.

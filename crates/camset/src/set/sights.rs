@@ -300,6 +300,11 @@ impl Sights {
         sights.iter().map(|&at| self.all[at].local).collect()
     }
 
+    /// The local point of a sight, in the set's frame.
+    pub(crate) fn position(&self, sight: usize) -> Vector3<f64> {
+        self.positions[self.all[sight].local]
+    }
+
     /// Local points that have any.
     pub(crate) fn all_points(&self) -> BTreeSet<usize> {
         self.all.iter().map(|sight| sight.local).collect()

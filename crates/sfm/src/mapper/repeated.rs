@@ -8,7 +8,7 @@ use setloc_features::{Match, Rays};
 
 use super::sides::{compare, count_matches, count_shareable, sees_all_around};
 use super::witnesses::{Witnesses, count_on_circles};
-use super::{MapperInput, Part, PutativePair};
+use super::{InputImage, MapperInput, Part, PutativePair};
 use crate::{ImageId, PairGeometry, Reconstruction, Rigid, TwoViewKind, verify_pair};
 
 /// Share of all verified matches that must lie in one-sided geometries for a model to be judged by the rest. Rendered
@@ -22,6 +22,8 @@ const MAX_POLE_DEG: f64 = 45.0;
 /// what lies underfoot right models have 0.98 to 1.00 (0.58 where a wallpaper repeats itself), folded ones 0.34 and 0.40.
 const MIN_JUDGING_PAIRS: usize = 3;
 const MIN_AGREEMENT: f64 = 0.5;
+/// The same of sets of photos: right models of rendered sets have 0.97 to 1.00, one folded by paving 0.48.
+const MIN_AGREEMENT_OF_PHOTOS: f64 = 0.7;
 /// Share of an image's points that must lie away from what repeats itself underfoot for more than that to hold it. In seven
 /// rendered rooms right images have 0.13 or more, one that the floor folded 0.015.
 const MIN_ELSEWHERE: f64 = 0.05;
@@ -29,6 +31,12 @@ const MIN_ELSEWHERE: f64 = 0.05;
 const MAX_BASELINE_DEG: f64 = 15.0;
 /// Largest angle in degrees from straight down, or from the middle of what repeats itself, of what is left out.
 const MAX_REPEATED_DEG: f64 = 70.0;
+/// The same from a photo's vertical axis: a photo looks ahead, and sees the ground far off.
+const MAX_REPEATED_IN_PHOTO_DEG: f64 = 85.0;
+/// Share of a geometry's matches below the middle of a photo from which it explains what lies underfoot.
+const MIN_BELOW: f64 = 0.9;
+/// [`MIN_SIDE_SHARE`] of photos, which see one side more than others.
+const MIN_SIDE_SHARE_OF_PHOTOS: f64 = 0.15;
 /// Share of the matches that a geometry explains on its worst side, relative to its best, below which it is one-sided.
 const MIN_SIDE_SHARE: f64 = 0.05;
 /// Fewest matches by which a side is judged.
@@ -83,8 +91,9 @@ fn second_from_first<'c>(
 /// What the pairs of an input see underfoot only.
 pub(super) struct Underfoot<'a> {
     input: &'a MapperInput<'a>,
-    /// Of panoramas that see all around.
+    /// Of photos, and of panoramas that see all around.
     rays: Vec<Option<Rays>>,
+    is_photo: Vec<bool>,
     /// Whether a pair of the input explains what lies underfoot and nothing else.
     is_one_sided: Vec<bool>,
     /// The middle of what each image sees of that, of any length: up to 38° aside, where it sees most of it.
@@ -96,11 +105,12 @@ pub(super) struct Underfoot<'a> {
 impl<'a> Underfoot<'a> {
     /// `None` where no pair does.
     pub fn find(input: &'a MapperInput<'a>) -> Option<Self> {
-        let rays: Vec<Option<Rays>> = (input.images.par_iter().with_max_len(1))
-            .map(|image| {
-                let camera = &input.cameras[image.camera.index()];
-                let is_plain = camera.is_panoramic() && image.mosaic.is_none();
-                is_plain.then(|| image.features.rays(camera)).filter(sees_all_around)
+        let camera_of = |image: &InputImage<'_>| &input.cameras[image.camera.index()];
+        let is_photo: Vec<bool> = input.images.iter().map(|image| !camera_of(image).is_panoramic()).collect();
+        let rays: Vec<Option<Rays>> = (input.images.par_iter().with_max_len(1).zip(&is_photo))
+            .map(|(image, is_photo)| {
+                let rays = image.mosaic.is_none().then(|| image.features.rays(camera_of(image)));
+                rays.filter(|rays| *is_photo || sees_all_around(rays))
             })
             .collect();
         let matches: BTreeMap<(ImageId, ImageId), &[Match]> =
@@ -108,7 +118,9 @@ impl<'a> Underfoot<'a> {
         let is_one_sided: Vec<bool> = (input.pairs.par_iter().with_max_len(8))
             .map(|pair| {
                 let all = matches.get(&(pair.first, pair.second)).copied().unwrap_or_default();
-                both(&rays, pair.first, pair.second).is_some_and(|rays| is_one_sided(rays, pair, all))
+                let are_photos = [pair.first, pair.second].map(|image| is_photo[image.index()]);
+                both(&rays, pair.first, pair.second)
+                    .is_some_and(|rays| is_one_sided(rays, are_photos, pair, all))
             })
             .collect();
         let mut middles = vec![Vector3::zeros(); rays.len()];
@@ -123,7 +135,7 @@ impl<'a> Underfoot<'a> {
         }
         let down = |middle: &Vector3<f64>| if middle.norm() > 0.0 { Vector3::y() } else { Vector3::zeros() };
         let downs = middles.iter().map(down).collect();
-        is_one_sided.contains(&true).then_some(Self { input, rays, is_one_sided, middles, downs })
+        is_one_sided.contains(&true).then_some(Self { input, rays, is_photo, is_one_sided, middles, downs })
     }
 
     /// The pairs that explain what lies underfoot only, or those that do not.
@@ -145,7 +157,8 @@ impl<'a> Underfoot<'a> {
     pub fn better_input(&self, components: &[Reconstruction], seed: u64) -> Option<(Remainder, String)> {
         if self.share() > MIN_REPEATED_SHARE {
             let judging = self.left_out(&self.middles, |_| true, seed);
-            if agreement(judging.pairs.iter(), components).is_some_and(|share| share < MIN_AGREEMENT) {
+            let enough = if self.is_photo.contains(&false) { MIN_AGREEMENT } else { MIN_AGREEMENT_OF_PHOTOS };
+            if agreement(judging.pairs.iter(), components).is_some_and(|share| share < enough) {
                 return Some((self.left_out(&self.downs, |_| true, seed), WARNING.to_owned()));
             }
         }
@@ -195,9 +208,14 @@ impl<'a> Underfoot<'a> {
     }
 
     fn is_near(&self, poles: &[Vector3<f64>], image: ImageId, feature: u32) -> bool {
-        let pole = &poles[image.index()];
+        let mut pole = poles[image.index()];
+        let mut angle = MAX_REPEATED_DEG;
+        if self.is_photo[image.index()] {
+            // The middle of what a photo sees of the ground is ahead rather than down.
+            (pole, angle) = (Vector3::y() * pole.norm(), MAX_REPEATED_IN_PHOTO_DEG);
+        }
         let bearing = self.rays[image.index()].as_ref().map(|rays| rays.bearings[feature as usize]);
-        bearing.is_some_and(|bearing| bearing.dot(pole) > MAX_REPEATED_DEG.to_radians().cos() * pole.norm())
+        bearing.is_some_and(|bearing| bearing.dot(&pole) > angle.to_radians().cos() * pole.norm())
     }
 
     /// Registered images of which next to no point lies away from what repeats itself.
@@ -259,16 +277,28 @@ fn both(rays: &[Option<Rays>], first: ImageId, second: ImageId) -> Option<[&Rays
 }
 
 /// Whether a geometry explains what lies underfoot, and next to nothing else.
-fn is_one_sided([first, second]: [&Rays; 2], pair: &PairGeometry, matches: &[Match]) -> bool {
-    let underfoot = |rays: &Rays, feature: fn(&Match) -> u32| {
+fn is_one_sided(
+    [first, second]: [&Rays; 2],
+    are_photos: [bool; 2],
+    pair: &PairGeometry,
+    matches: &[Match],
+) -> bool {
+    let underfoot = |rays: &Rays, is_photo: bool, feature: fn(&Match) -> u32| {
         let seen = pair.two_view.inliers.iter().filter_map(|m| rays.bearings.get(feature(m) as usize));
+        if is_photo {
+            let below = seen.filter(|bearing| bearing.y > 0.0).count();
+            return below as f64 >= MIN_BELOW * pair.two_view.inliers.len() as f64;
+        }
         seen.sum::<Vector3<f64>>().angle(&Vector3::y()) <= MAX_POLE_DEG.to_radians()
     };
-    if !underfoot(first, |m| m.first) || !underfoot(second, |m| m.second) {
+    if !underfoot(first, are_photos[0], |m| m.first) || !underfoot(second, are_photos[1], |m| m.second) {
         return false;
     }
     let explained = count_matches(first, &pair.two_view.inliers);
     let of_matches = compare(&count_matches(first, matches), &explained, MIN_SIDE_MATCHES);
+    if are_photos.contains(&true) {
+        return of_matches.worst < MIN_SIDE_SHARE_OF_PHOTOS;
+    }
     if of_matches.worst < MIN_SIDE_SHARE {
         return true;
     }
