@@ -6,11 +6,11 @@ use std::sync::Arc;
 use anyhow::Result;
 use rayon::prelude::*;
 use setloc_features::{Calibration, Camera, ImageFeatures};
-use setloc_sfm::MapperOutput;
+use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
 
 use crate::artifacts::LikelyImages;
 use crate::config::Config;
-use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage};
+use crate::dataset::{ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Executor, JobGraph, RunResult};
@@ -165,40 +165,21 @@ fn with_estimated_cameras(
     jobs: &SceneModelJobs,
     model: &MapperOutput,
 ) -> Option<Vec<SourceImage>> {
-    let mut told: Vec<(&Camera, usize, &Camera)> = Vec::new();
-    for component in &model.components {
-        let mut counts: Vec<(&Camera, usize, &Camera)> = Vec::new();
-        for id in component.registered() {
+    let registered = |component: &Reconstruction, guess: &Camera| -> Vec<ImageId> {
+        let is_of_guess = |id: &ImageId| {
             let given = jobs.image_given(&component.images[id.index()]).and_then(|at| images.get(at));
-            let Some(given) = given.filter(|image| image.calibration == Calibration::Guessed) else {
-                continue;
-            };
-            match counts.iter_mut().find(|(guess, ..)| **guess == given.camera) {
-                Some((_, count, _)) => *count += 1,
-                None => counts.push((&given.camera, 1, component.camera_of(id))),
-            }
-        }
-        for found in counts.into_iter().filter(|(_, count, _)| *count >= MIN_IMAGES) {
-            match told.iter_mut().find(|(guess, ..)| *guess == found.0) {
-                Some(best) if best.1 < found.1 => *best = found,
-                Some(_) => {}
-                None => told.push(found),
-            }
-        }
-    }
-    let image = |image: &SourceImage| {
-        let is_guess = |(guess, ..): &&(&Camera, usize, &Camera)| **guess == image.camera;
-        let camera = told.iter().find(is_guess).filter(|_| image.calibration == Calibration::Guessed);
-        camera.map_or_else(
-            || image.clone(),
-            |(.., camera)| SourceImage {
-                camera: (*camera).clone(),
-                camera_origin: CameraOrigin::Estimated,
-                ..image.clone()
-            },
-        )
+            given.is_some_and(|image| image.is_guess(guess))
+        };
+        component.registered().filter(is_of_guess).collect()
     };
-    (!told.is_empty()).then(|| images.iter().map(image).collect())
+    let told = |guess: &Camera| {
+        // Of equal numbers the last counts most: that of the larger component.
+        let found = model.components.iter().rev().map(|component| (component, registered(component, guess)));
+        let (component, images) = found.max_by_key(|(_, images)| images.len())?;
+        let first = images.first().filter(|_| images.len() >= MIN_IMAGES)?;
+        Some(component.camera_of(*first).clone())
+    };
+    with_told_cameras(images, Calibration::Guessed, told)
 }
 
 /// What the jobs came to; the scene is read unless it is `present`.

@@ -8,7 +8,7 @@ mod truth;
 
 pub use cameras::CameraBook;
 pub use geo::{GeoBook, GeoSource};
-pub use images::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images};
+pub use images::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, with_told_cameras};
 pub use truth::{Truth, TruthPose};
 
 use std::collections::BTreeMap;

@@ -9,7 +9,7 @@ use setloc_features::{Calibration, Camera};
 use setloc_sfm::MapperOutput;
 
 use crate::building::alike_pairs;
-use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage};
+use crate::dataset::{ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, RunResult};
 use crate::jobs::{LocateJobs, LocatedJobs, add_features_of, add_grown, add_set, add_singles};
@@ -132,11 +132,10 @@ pub fn locate(
 /// theirs, else photos whose pose is uncertain.
 fn with_estimated_cameras(images: &[SourceImage], set: Option<&SetLocalization>) -> Option<Vec<SourceImage>> {
     let placed: BTreeMap<&str, &PhotoLocalization> = set?.refined.iter().map(|p| (&*p.name, p)).collect();
-    let is_guessed = |image: &SourceImage| image.calibration == Calibration::Guessed;
     let told = |guess: &Camera| {
-        let alike = |image: &&SourceImage| is_guessed(image) && image.camera == *guess;
         let mut support: Vec<(&Camera, [usize; 2])> = Vec::new();
-        for photo in images.iter().filter(alike).filter_map(|image| placed.get(&*image.name)) {
+        let alike = images.iter().filter(|image| image.is_guess(guess));
+        for photo in alike.filter_map(|image| placed.get(&*image.name)) {
             let [localized, uncertain] = match photo.verdict {
                 Verdict::Localized => [photo.inliers, 0],
                 Verdict::Uncertain => [0, photo.inliers],
@@ -153,15 +152,7 @@ fn with_estimated_cameras(images: &[SourceImage], set: Option<&SetLocalization>)
         let best = support.into_iter().max_by_key(|(_, points)| *points);
         best.map(|(camera, _)| camera.clone().with_tangential_distortion())
     };
-    let estimated = |image: &SourceImage| {
-        let camera = Some(image).filter(|image| is_guessed(image)).and_then(|image| told(&image.camera))?;
-        let (calibration, camera_origin) = (Calibration::Estimated, CameraOrigin::Estimated);
-        Some(SourceImage { camera, calibration, camera_origin, ..image.clone() })
-    };
-    let estimated: Vec<Option<SourceImage>> = images.iter().map(estimated).collect();
-    let any = estimated.iter().any(Option::is_some);
-    let image = |(new, old): (Option<SourceImage>, &SourceImage)| new.unwrap_or_else(|| old.clone());
-    any.then(|| estimated.into_iter().zip(images).map(image).collect())
+    with_told_cameras(images, Calibration::Estimated, told)
 }
 
 /// Runs one graph: each photo alone, the set, or both.
@@ -289,6 +280,7 @@ pub fn grow(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::dataset::CameraOrigin;
 
     #[test]
     fn guessed_cameras_become_those_that_most_of_the_scene_tells() {

@@ -35,6 +35,38 @@ pub struct SourceImage {
     pub mask: Option<(PathBuf, ContentHash)>,
 }
 
+impl SourceImage {
+    /// Whether this camera was guessed of the image.
+    pub fn is_guess(&self, camera: &Camera) -> bool {
+        self.calibration == Calibration::Guessed && self.camera == *camera
+    }
+}
+
+/// The images with the cameras that are told in place of guessed ones, which become `calibration`; `None` when none is
+/// told.
+pub fn with_told_cameras(
+    images: &[SourceImage],
+    calibration: Calibration,
+    told: impl Fn(&Camera) -> Option<Camera>,
+) -> Option<Vec<SourceImage>> {
+    let mut known: Vec<(&Camera, Option<Camera>)> = Vec::new();
+    for image in images.iter().filter(|image| image.calibration == Calibration::Guessed) {
+        if known.iter().all(|(guess, _)| **guess != image.camera) {
+            known.push((&image.camera, told(&image.camera)));
+        }
+    }
+    let with_camera = |image: &SourceImage| {
+        let found =
+            known.iter().find(|(guess, _)| image.is_guess(guess)).and_then(|(_, camera)| camera.clone());
+        let camera_origin = CameraOrigin::Estimated;
+        found.map_or_else(
+            || image.clone(),
+            |camera| SourceImage { camera, calibration, camera_origin, ..image.clone() },
+        )
+    };
+    known.iter().any(|(_, camera)| camera.is_some()).then(|| images.iter().map(with_camera).collect())
+}
+
 /// Where an image's camera comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CameraOrigin {
@@ -42,7 +74,7 @@ pub enum CameraOrigin {
     Listed,
     /// From the image itself, or from nothing.
     Guessed(CameraSource),
-    /// From the set's localization.
+    /// From a set's localization, or from a first model.
     Estimated,
 }
 
