@@ -4,6 +4,7 @@ use nalgebra::Vector3;
 use setloc_sfm::Rigid;
 
 use crate::Scene;
+use crate::evidence::median;
 
 /// Images stand about upright where the mean of their vertical axes is as long as this; else nobody knows which way is down.
 const MIN_UPRIGHT: f64 = 0.9;
@@ -35,9 +36,7 @@ impl Underfoot {
     /// as well as the right one, however many points agree: what stands on the ground has to agree, too.
     pub(crate) fn count_elsewhere(&self, seen: &[(Vector3<f64>, Vector3<f64>)]) -> usize {
         let below: Vec<f64> = seen.iter().map(|(center, point)| (point - center).dot(&self.down)).collect();
-        let mut sorted = below.clone();
-        sorted.sort_by(f64::total_cmp);
-        let Some(&height) = sorted.get(sorted.len() / 2).filter(|height| **height > 0.0) else {
+        let Some(height) = median(below.clone()).filter(|height| *height > 0.0) else {
             return seen.len();
         };
         let is_elsewhere = |((center, point), below): &(&(Vector3<f64>, Vector3<f64>), f64)| {

@@ -14,7 +14,7 @@ use crate::dataset::{ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Executor, JobGraph, RunResult};
-use crate::jobs::{LikelyJobs, SceneJobs, SceneModelJobs, add_scene, add_scene_model};
+use crate::jobs::{LikelyJobs, SceneJobs, SceneModelJobs, add_first_model, add_scene};
 use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::stages::FeatureParams;
@@ -99,8 +99,7 @@ pub fn alike_pairs(
         return Ok((Vec::new(), RunResult::default()));
     };
     session.run(name, &graph, |executor, run| {
-        let found =
-            executor.output(jobs.likely).map(|_| executor.load::<LikelyImages>(jobs.likely)).transpose()?;
+        let found = executor.load_made::<LikelyImages>(jobs.likely)?;
         Ok((found.map(|found| jobs.pairs(&found)).unwrap_or_default(), run.clone()))
     })
 }
@@ -108,25 +107,6 @@ pub fn alike_pairs(
 /// Whether a scene of these images is mapped twice.
 pub fn has_guessed_cameras(images: &[SourceImage]) -> bool {
     images.iter().any(|image| image.calibration == Calibration::Guessed)
-}
-
-/// Adds the jobs of the model that tells guessed cameras.
-///
-/// # Errors
-/// When parameters have no JSON form.
-pub fn add_first_model(
-    graph: &mut JobGraph<'_>,
-    images: &[SourceImage],
-    alike: &[(usize, usize)],
-    config: &Config,
-    seed: u64,
-) -> Result<SceneModelJobs> {
-    let mut config = config.clone();
-    // Cameras need no better points than those of the keypoints.
-    config.alignment.enabled = false;
-    let jobs = add_scene_model(graph, images, alike, &config, seed)?;
-    graph.want(jobs.model);
-    Ok(jobs)
 }
 
 /// The images with the cameras that a first model tells in place of guessed ones, `None` when it tells none, and what that
@@ -148,8 +128,7 @@ pub fn estimate_cameras(
     let mut graph = JobGraph::default();
     let jobs = add_first_model(&mut graph, images, alike, config, seed)?;
     session.run(name, &graph, |executor, run| {
-        let model = executor.output(jobs.model).map(|_| executor.load::<MapperOutput>(jobs.model));
-        let model = model.transpose()?;
+        let model = executor.load_made::<MapperOutput>(jobs.model)?;
         Ok((model.and_then(|model| with_estimated_cameras(images, &jobs, &model)), run.clone()))
     })
 }

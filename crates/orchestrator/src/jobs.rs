@@ -13,7 +13,7 @@ pub use likely::LikelyJobs;
 pub use locate::{LocateJobs, SetJobs, add_set, add_singles};
 pub use model::{ModelJobs, ModelKind, add_features_of, add_model};
 pub use pairs::choose_pairs;
-pub use scene::{SceneJobs, SceneModelJobs, add_scene, add_scene_model};
+pub use scene::{SceneJobs, SceneModelJobs, add_first_model, add_scene};
 
 use crate::fingerprint::ContentHash;
 

@@ -174,9 +174,8 @@ fn run(
             }
         }
         for job in single.iter().filter(|_| alone) {
-            if executor.output(*job).is_some() {
-                located.single.push(executor.load::<AnywhereLocalization>(*job)?.photo.clone());
-            }
+            let made = executor.load_made::<AnywhereLocalization>(*job)?;
+            located.single.extend(made.map(|found| found.photo.clone()));
         }
         if let Some(set) = set.filter(|set| executor.output(set.set).is_some()) {
             located.set = Some((*executor.load::<SetLocalization>(set.set)?).clone());

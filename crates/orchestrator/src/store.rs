@@ -362,11 +362,19 @@ pub fn remove_leftovers(folder: &Path) {
     }
 }
 
-/// Removes a file; that it is not there is no error.
+/// Removes these files of a folder, and the folder if nothing else is in it; that they are not there is no error.
 ///
 /// # Errors
-/// When it is there and cannot be removed.
-pub fn remove(path: &Path) -> Result<()> {
+/// When one is there and cannot be removed.
+pub fn remove_files(folder: &Path, names: &[&str]) -> Result<()> {
+    names.iter().try_for_each(|name| remove(&folder.join(name)))?;
+    // It stays where somebody else's files are in it.
+    let _ = fs::remove_dir(folder);
+    Ok(())
+}
+
+/// Removes a file; that it is not there is no error.
+fn remove(path: &Path) -> Result<()> {
     match fs::remove_file(path) {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(write_error(error, path)),
         _ => Ok(()),

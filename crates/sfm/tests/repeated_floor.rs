@@ -54,11 +54,7 @@ impl Room {
             let side = if rng.random_bool(0.5) { 2.5 } else { -2.5 };
             Vector3::new(side, height, along)
         };
-        let pose = |k: usize, rng: &mut ChaCha8Rng| {
-            let center = Vector3::new(rng.random_range(-0.4..0.4), rng.random_range(-0.05..0.05), k as f64);
-            Rigid::new(UnitQuaternion::from_euler_angles(0.0, rng.random_range(-3.1..3.1), 0.0), center)
-        };
-        Self::seen_from(Camera::equirectangular(2048, 1024), wall, pose, (-3..11, 2.4))
+        Self::seen_from(Camera::equirectangular(2048, 1024), wall, 3.1, (-3..11, 2.4))
     }
 
     /// Seven photos 1 m apart that look ahead along a tiled street between two walls.
@@ -68,20 +64,17 @@ impl Room {
             let side = if rng.random_bool(0.5) { 4.0 } else { -4.0 };
             Vector3::new(side, height, along)
         };
-        let pose = |k: usize, rng: &mut ChaCha8Rng| {
-            let center = Vector3::new(rng.random_range(-0.4..0.4), rng.random_range(-0.05..0.05), k as f64);
-            Rigid::new(UnitQuaternion::from_euler_angles(0.0, rng.random_range(-0.05..0.05), 0.0), center)
-        };
         let params = vec![1100.0, 1100.0, 800.0, 600.0];
         let camera = Camera { model: CameraModel::Pinhole, width: 1600, height: 1200, params };
-        Self::seen_from(camera, wall, pose, (-3..20, 9.0))
+        Self::seen_from(camera, wall, 0.05, (-3..20, 9.0))
     }
 
-    /// Points of walls and a floor with rows of tiles, of which each image sees what is within reach.
+    /// Points of walls and a floor with rows of tiles, of which each image, turned by up to `turn` radians, sees what is within
+    /// reach.
     fn seen_from(
         camera: Camera,
         wall: impl Fn(&mut ChaCha8Rng) -> Vector3<f64>,
-        pose: impl Fn(usize, &mut ChaCha8Rng) -> Rigid,
+        turn: f64,
         (rows, reach): (Range<i32>, f64),
     ) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
@@ -97,7 +90,10 @@ impl Room {
         let (width, height) = (camera.width, camera.height);
         let mut room = Self { truth: vec![], camera, features: vec![], seen: vec![] };
         for k in 0..7 {
-            let pose = pose(k, &mut rng);
+            let center =
+                Vector3::new(rng.random_range(-0.4..0.4), rng.random_range(-0.05..0.05), f64::from(k));
+            let yaw = rng.random_range(-turn..turn);
+            let pose = Rigid::new(UnitQuaternion::from_euler_angles(0.0, yaw, 0.0), center);
             let mut features = ImageFeatures { width, height, ..ImageFeatures::default() };
             let mut seen = Vec::new();
             for (what, point) in &points {

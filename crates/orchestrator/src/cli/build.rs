@@ -10,20 +10,18 @@ use setloc_sfm::{ImageId, Reconstruction};
 
 use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
-use crate::building::{
-    BuildOutcome, Built, add_first_model, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras,
-};
+use crate::building::{BuildOutcome, Built, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras};
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images};
 use crate::error::Hinted;
 use crate::export::{Marker, colmap_lacks, ply, remove_colmap, renew_colmap, scene_json, top_view_png};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, Prediction};
-use crate::jobs::{LikelyJobs, add_scene};
+use crate::jobs::{LikelyJobs, add_first_model, add_scene};
 use crate::print;
 use crate::scene::SceneFile;
 use crate::session::{Session, cache_folder};
-use crate::store::{RunRecord, Store, remove, write_atomically};
+use crate::store::{RunRecord, Store, remove_files, write_atomically};
 
 /// Blue, for cameras of the scene.
 pub const SCENE_COLOR: [u8; 3] = [30, 90, 220];
@@ -121,6 +119,12 @@ pub fn plan(args: &PlanArgs) -> Result<Answer> {
     Ok(Answer::Done)
 }
 
+/// Whether the results of all jobs are stored, so that running them only reads.
+fn is_stored(graph: &JobGraph<'_>, store: &Store) -> bool {
+    let planned = graph.plan(store, &RunRecord::default());
+    planned.iter().all(|job| job.prediction == Prediction::Stored)
+}
+
 /// Pairs of images that look alike, as far as that is known: a plan runs nothing.
 fn stored_alike_pairs(
     args: &PlanArgs,
@@ -132,8 +136,7 @@ fn stored_alike_pairs(
     if LikelyJobs::add(&mut graph, "all", &folder.images, &config.features, config)?.is_none() {
         return Ok(Vec::new());
     }
-    let planned = graph.plan(store, &RunRecord::default());
-    if planned.iter().any(|job| job.prediction != Prediction::Stored) {
+    if !is_stored(&graph, store) {
         print::note(
             "pairs of images that look alike are chosen once their features are known, and not listed",
         );
@@ -159,8 +162,7 @@ fn next_jobs<'g>(
         return Ok(graph);
     }
     add_first_model(&mut graph, &folder.images, alike, config, seed)?;
-    let planned = graph.plan(store, &RunRecord::default());
-    if planned.iter().any(|job| job.prediction != Prediction::Stored) {
+    if !is_stored(&graph, store) {
         print::note("cameras are estimated by a first model, and what follows from them is not listed");
         return Ok(graph);
     }
@@ -252,21 +254,23 @@ pub fn write_models(
     scene: &SceneFile,
     features: &BTreeMap<String, Arc<ImageFeatures>>,
 ) -> Result<()> {
-    write_json(&folder.join("poses.json"), &scene_json(scene))?;
+    let none = [Reconstruction::default()];
+    let components = if scene.components.is_empty() { &none[..] } else { &scene.components };
     let grown = scene.grown_names();
-    let none = Reconstruction::default();
-    write_model(folder, scene.main().unwrap_or(&none), features, &grown)?;
-    for (at, component) in scene.components.iter().enumerate().skip(1) {
-        write_model(&component_folder(folder, at), component, features, &grown)?;
-    }
+    let write = |(at, component)| write_model(&component_folder(folder, at), component, features, &grown);
+    let (poses, models) = rayon::join(
+        || write_json(&folder.join("poses.json"), &scene_json(scene)),
+        || components.par_iter().with_max_len(1).enumerate().try_for_each(write),
+    );
+    poses.and(models)?;
     // An earlier scene may have had more of them.
-    let older = (scene.components.len().max(1)..).map(|at| component_folder(folder, at));
+    let older = (components.len()..).map(|at| component_folder(folder, at));
     older.take_while(|folder| folder.is_dir()).try_for_each(|folder| remove_model(&folder))
 }
 
-/// Where the exports of a component beside the largest are; numbered from 1, as people are told them.
+/// Where the exports of a component are: of the largest in the folder itself. Numbers are those that people are told.
 fn component_folder(folder: &Path, at: usize) -> PathBuf {
-    folder.join(format!("component_{}", at + 1))
+    if at == 0 { folder.to_owned() } else { folder.join(format!("component_{}", at + 1)) }
 }
 
 const POINT_CLOUD: &str = "points.ply";
@@ -297,12 +301,7 @@ fn write_model(
 /// Removes what [`write_model`] wrote for an earlier scene, and the folder if nothing else is in it.
 fn remove_model(folder: &Path) -> Result<()> {
     remove_colmap(&folder.join(COLMAP_MODEL))?;
-    for name in [POINT_CLOUD, PICTURE] {
-        remove(&folder.join(name))?;
-    }
-    // It stays where somebody else's files are in it.
-    let _ = std::fs::remove_dir(folder);
-    Ok(())
+    remove_files(folder, &[POINT_CLOUD, PICTURE])
 }
 
 /// What the run cost and what is wrong with the scene, and with the images that it was given; written last.

@@ -14,7 +14,7 @@ use crate::store::write_atomically;
 pub fn run(args: &ExportArgs) -> Result<Answer> {
     let scene = SceneFile::read(&args.scene)?;
     let component = component(&scene, args.component)?;
-    let model = &component.by_name();
+    let model = &component.map_or_else(Reconstruction::default, Reconstruction::by_name);
     let needs_output =
         || Hinted::error("this format is not written to standard output", "name a file or folder with -o");
     let markers = scene_markers(model, &scene.grown_names());
@@ -56,14 +56,13 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
     Ok(Answer::Done)
 }
 
-/// A component of the scene by its number, from 1 on; a scene without any has an empty first one.
-fn component(scene: &SceneFile, number: usize) -> Result<Reconstruction> {
+/// A component of the scene by its number, from 1 on; `None` for the first of a scene without any.
+fn component(scene: &SceneFile, number: usize) -> Result<Option<&Reconstruction>> {
     match number.checked_sub(1).and_then(|at| scene.components.get(at)) {
-        Some(component) => Ok(component.clone()),
-        None if number == 1 => Ok(Reconstruction::default()),
-        None => Err(Hinted::error(
+        None if number != 1 => Err(Hinted::error(
             format!("the scene has no component {number}"),
             format!("it has {}, counted from 1, the largest", scene.components.len()),
         )),
+        component => Ok(component),
     }
 }

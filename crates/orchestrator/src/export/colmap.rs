@@ -8,7 +8,7 @@ use setloc_features::{ImageFeatures, Keypoint};
 use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage, ReconstructionPoint};
 
 use crate::error::Hinted;
-use crate::store::{remove, write_pieces_atomically};
+use crate::store::{remove_files, write_pieces_atomically};
 
 /// What a model consists of.
 const FILES: [&str; 3] = ["cameras.txt", "images.txt", "points3D.txt"];
@@ -145,12 +145,7 @@ pub fn renew_colmap(
 /// # Errors
 /// When a file cannot be removed.
 pub fn remove_colmap(folder: &Path) -> Result<()> {
-    for name in FILES {
-        remove(&folder.join(name))?;
-    }
-    // It stays where somebody else's files are in it.
-    let _ = std::fs::remove_dir(folder);
-    Ok(())
+    remove_files(folder, &FILES)
 }
 
 #[cfg(test)]

@@ -407,6 +407,14 @@ impl<'a> Executor<'a> {
         self.lock().slots[id.index()].output
     }
 
+    /// A job's result as [`Executor::load`] gives it, `None` when it has none.
+    ///
+    /// # Errors
+    /// When it can neither be read nor made again.
+    pub fn load_made<T: Artifact>(&self, id: JobId) -> Result<Option<Arc<T>>> {
+        self.output(id).map(|_| self.load(id)).transpose()
+    }
+
     /// What became of a job.
     pub fn state(&self, id: JobId) -> State {
         self.lock().slots[id.index()].state.clone()

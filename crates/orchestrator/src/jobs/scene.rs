@@ -78,18 +78,22 @@ fn add_ordered_model(
     Ok(OrderedModel { jobs, images, order, origin })
 }
 
-/// Adds all jobs from image files to a scene's model; `alike` are pairs of images that look alike.
+/// Adds all jobs from image files to the model that tells guessed cameras; `alike` are pairs of images that look alike.
 ///
 /// # Errors
 /// When parameters have no JSON form.
-pub fn add_scene_model(
+pub fn add_first_model(
     graph: &mut JobGraph<'_>,
     images: &[SourceImage],
     alike: &[(usize, usize)],
     config: &Config,
     seed: u64,
 ) -> Result<SceneModelJobs> {
-    let OrderedModel { jobs, order, .. } = add_ordered_model(graph, images, alike, config, seed)?;
+    let mut config = config.clone();
+    // Cameras need no better points than those of the keypoints.
+    config.alignment.enabled = false;
+    let OrderedModel { jobs, order, .. } = add_ordered_model(graph, images, alike, &config, seed)?;
+    graph.want(jobs.model);
     Ok(SceneModelJobs { model: jobs.model, order })
 }
 

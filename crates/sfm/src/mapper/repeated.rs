@@ -134,7 +134,12 @@ impl<'a> Underfoot<'a> {
             }
         }
         let down = |middle: &Vector3<f64>| if middle.norm() > 0.0 { Vector3::y() } else { Vector3::zeros() };
-        let downs = middles.iter().map(down).collect();
+        let downs: Vec<Vector3<f64>> = middles.iter().map(down).collect();
+        for ((middle, down), _) in middles.iter_mut().zip(&downs).zip(&is_photo).filter(|(_, photo)| **photo)
+        {
+            // What a photo sees of the ground is ahead rather than down.
+            *middle = *down;
+        }
         is_one_sided.contains(&true).then_some(Self { input, rays, is_photo, is_one_sided, middles, downs })
     }
 
@@ -208,14 +213,10 @@ impl<'a> Underfoot<'a> {
     }
 
     fn is_near(&self, poles: &[Vector3<f64>], image: ImageId, feature: u32) -> bool {
-        let mut pole = poles[image.index()];
-        let mut angle = MAX_REPEATED_DEG;
-        if self.is_photo[image.index()] {
-            // The middle of what a photo sees of the ground is ahead rather than down.
-            (pole, angle) = (Vector3::y() * pole.norm(), MAX_REPEATED_IN_PHOTO_DEG);
-        }
+        let pole = &poles[image.index()];
+        let angle = if self.is_photo[image.index()] { MAX_REPEATED_IN_PHOTO_DEG } else { MAX_REPEATED_DEG };
         let bearing = self.rays[image.index()].as_ref().map(|rays| rays.bearings[feature as usize]);
-        bearing.is_some_and(|bearing| bearing.dot(&pole) > angle.to_radians().cos() * pole.norm())
+        bearing.is_some_and(|bearing| bearing.dot(pole) > angle.to_radians().cos() * pole.norm())
     }
 
     /// Registered images of which next to no point lies away from what repeats itself.
