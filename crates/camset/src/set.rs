@@ -395,6 +395,44 @@ mod tests {
     }
 
     #[test]
+    fn a_local_model_that_several_photos_contradict_localizes_nothing() {
+        let world = World::chain(9, 0.2, 1);
+        let (scene, queries) = (world.scene(), world.queries());
+        let located = |moved: usize| {
+            let alone = queries.iter().map(|photo| locate_single(&SingleParams::default(), &scene, photo, 7));
+            let mut alone: Vec<SingleLocalization> = alone.collect();
+            let localized = |photo: &&mut SingleLocalization| photo.photo.verdict == Verdict::Localized;
+            for alone in alone.iter_mut().filter(localized).take(moved) {
+                if let Some(pose) = &mut alone.photo.world_from_camera {
+                    pose.translation.z += 8.0;
+                }
+            }
+            let models = std::slice::from_ref(&world.local);
+            let params = CamsetParams::default();
+            let found = locate_with(&params, &scene, (&*queries, &*alone), models, Views::default, 7);
+            (alone, found)
+        };
+        let (_, found) = located(1);
+        let verdicts = found.refined.iter().map(|photo| photo.verdict);
+        assert_eq!(verdicts.filter(|verdict| *verdict == Verdict::Localized).count(), 8);
+        assert_eq!(found.contradicted.len(), 1);
+        let (alone, found) = located(2);
+        for (photo, alone) in found.refined.iter().zip(&alone) {
+            assert_eq!(
+                photo.verdict == Verdict::Localized,
+                alone.photo.verdict == Verdict::Localized,
+                "{photo:?}"
+            );
+            if photo.verdict == Verdict::Localized {
+                assert_eq!(photo.world_from_camera, alone.photo.world_from_camera);
+            }
+        }
+        assert!(found.rigid.iter().all(|photo| photo.verdict != Verdict::Localized));
+        assert!(found.contradicted.is_empty());
+        assert_ne!(found.refined[8].verdict, Verdict::Localized);
+    }
+
+    #[test]
     fn the_ground_alone_localizes_neither_photo_nor_set() {
         let alone = |world: &World| {
             let photo = locate_single(&SingleParams::default(), &world.scene(), &world.queries()[0], 7).photo;

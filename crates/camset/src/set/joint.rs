@@ -36,6 +36,10 @@ const MIN_KEPT: f64 = 0.5;
 /// Fewest matches seen from elsewhere than the rest that give a set its scale at all.
 const MIN_FOR_SCALE: usize = 3;
 
+/// Photos localized alone elsewhere than their local model has them, from which on it is not trusted: one may be wrong
+/// itself.
+const MIN_CONTRADICTING: usize = 2;
+
 /// Scales at which a set is tried to see what it shows by chance; nearer ones show some of what the right one does.
 const OTHER_SCALES: [f64; 10] = [0.15, 0.25, 0.35, 0.5, 0.6, 1.6, 2.0, 2.8, 4.0, 6.0];
 
@@ -259,8 +263,10 @@ impl Component<'_> {
             reasons.push(format!("its scale rests on {elsewhere} matches seen from elsewhere than the rest"));
             support = weaker(support, Verdict::Uncertain);
         }
-        let (mut refined, elsewhere_alone) =
+        let (mut refined, mut elsewhere_alone) =
             self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
+        let is_distrusted =
+            elsewhere_alone.iter().filter(|elsewhere| **elsewhere).count() >= MIN_CONTRADICTING;
         let mut without_scale = Vec::new();
         if has_scale
             && elsewhere.max(joint.seen_from_elsewhere()).max(joint.viewed_from_elsewhere) < MIN_FOR_SCALE
@@ -292,6 +298,9 @@ impl Component<'_> {
         for slot in without_scale {
             refuse_without_scale(&mut rigid_answers[slot]);
         }
+        if is_distrusted {
+            remarks.push(self.distrust(&mut refined, &mut rigid_answers, &mut elsewhere_alone));
+        }
         ComponentAnswer::Localized(Box::new(ComponentPoses {
             world_from_set: rigid.world_from_set,
             rigid: rigid_answers,
@@ -308,6 +317,37 @@ impl Component<'_> {
             refined,
             remarks,
         }))
+    }
+
+    /// Takes the photos' own word where several contradict the local model: it is bent, or two places are one in it, and then
+    /// no other pose that rests on it is sure. Says which they are.
+    fn distrust(
+        &self,
+        refined: &mut [PhotoLocalization],
+        rigid: &mut [PhotoLocalization],
+        elsewhere: &mut [bool],
+    ) -> String {
+        let contradicting: Vec<&str> = (refined.iter().zip(elsewhere.iter()))
+            .filter(|(_, elsewhere)| **elsewhere)
+            .map(|(photo, _)| photo.name.as_str())
+            .collect();
+        let reason =
+            format!("its local model is contradicted by {}, localized alone", contradicting.join(", "));
+        for (slot, photo) in refined.iter_mut().enumerate() {
+            let alone = &self.evidence[self.members[slot]].photo;
+            if alone.verdict == Verdict::Localized {
+                photo.clone_from(alone);
+            }
+            photo.reasons.push(reason.clone());
+            if alone.verdict != Verdict::Localized {
+                photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
+            }
+        }
+        for photo in rigid {
+            photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
+        }
+        elsewhere.fill(false);
+        reason
     }
 
     /// Lengths of baselines that the local points do not tell, and the slots that they lie between.
