@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{Matrix6, Vector3};
-use setloc_features::{Camera, ParamRole};
+use setloc_features::Camera;
 use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::robust::{RansacParams, estimate_absolute_pose};
 use setloc_sfm::{ImageId, Rigid};
@@ -230,7 +230,7 @@ fn best_hypothesis(
     let cameras: Vec<Camera> = if photo.calibration.is_settled() {
         vec![photo.camera.clone()]
     } else {
-        FOCAL_FACTORS.iter().map(|&factor| with_focal_factor(photo.camera, factor)).collect()
+        FOCAL_FACTORS.iter().map(|&factor| photo.camera.with_focal_times(factor)).collect()
     };
     let mut best: Option<Hypothesis> = None;
     for (number, camera) in cameras.into_iter().enumerate() {
@@ -319,17 +319,6 @@ fn covisible_subsets(index: &SceneIndex, matches: &[SceneMatch], count: usize) -
     subsets.sort_by_key(|subset| std::cmp::Reverse(subset.len()));
     subsets.truncate(count);
     subsets
-}
-
-/// The camera with its focal length (or lengths) multiplied.
-fn with_focal_factor(camera: &Camera, factor: f64) -> Camera {
-    let mut scaled = camera.clone();
-    for (value, role) in scaled.params.iter_mut().zip(camera.param_roles()) {
-        if *role == ParamRole::Focal {
-            *value *= factor;
-        }
-    }
-    scaled
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::Result;
 use rayon::prelude::*;
 use setloc_features::{Calibration, Camera, ImageFeatures};
-use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
+use setloc_sfm::{ImageId, MapperOutput, Reconstruction, ReconstructionPoint};
 
 use crate::artifacts::LikelyImages;
 use crate::config::Config;
@@ -133,8 +133,11 @@ pub fn estimate_cameras(
     })
 }
 
-/// Fewer images of a camera tell it too poorly to replace a guess.
+/// Images of a camera that tell it well enough to replace a guess.
 const MIN_IMAGES: usize = 3;
+
+/// Points, each seen by three images or more, that make fewer images do.
+const MIN_HELD_POINTS: usize = 30;
 
 /// The images with the cameras of a model in place of guessed ones; `None` when it tells none.
 ///
@@ -151,14 +154,20 @@ fn with_estimated_cameras(
         };
         component.registered().filter(is_of_guess).collect()
     };
+    let is_told = |component: &Reconstruction, images: &[ImageId]| {
+        let shows = |point: &&ReconstructionPoint| {
+            point.track.len() >= 3 && point.track.iter().any(|seen| images.contains(&seen.image))
+        };
+        images.len() >= MIN_IMAGES || component.points.iter().filter(shows).count() >= MIN_HELD_POINTS
+    };
     let told = |guess: &Camera| {
         // Of equal numbers the last counts most: that of the larger component.
         let found = model.components.iter().rev().map(|component| (component, registered(component, guess)));
         let (component, images) = found.max_by_key(|(_, images)| images.len())?;
-        let first = images.first().filter(|_| images.len() >= MIN_IMAGES)?;
-        Some(component.camera_of(*first).clone())
+        let first = images.first().filter(|_| is_told(component, &images))?;
+        Some((component.camera_of(*first).clone(), Calibration::Guessed))
     };
-    with_told_cameras(images, Calibration::Guessed, told)
+    with_told_cameras(images, told)
 }
 
 /// What the jobs came to; the scene is read unless it is `present`.

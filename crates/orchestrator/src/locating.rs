@@ -9,7 +9,7 @@ use setloc_features::{Calibration, Camera};
 use setloc_sfm::MapperOutput;
 
 use crate::building::alike_pairs;
-use crate::dataset::{ImageFolder, SkippedImage, SourceImage, with_told_cameras};
+use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, RunResult};
 use crate::jobs::{LocateJobs, LocatedJobs, add_features_of, add_grown, add_set, add_singles};
@@ -107,7 +107,17 @@ pub fn locate(
         located.single.iter().any(|photo| photo.name == target && photo.verdict == Verdict::Localized);
     let wanted = matches!(mode, Mode::Set | Mode::Both) || (mode == Mode::Auto && !found);
     if wanted {
-        whole.absorb(run(session, folder, what, (name, target), (mode == Mode::Both, true), &mut located)?);
+        if folder.images.iter().any(|image| is_lone_guess(&folder.images, image)) {
+            if located.single.is_empty() {
+                whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);
+            }
+            improve_lone_guesses(&mut folder.images, &located.single);
+            if mode == Mode::Set {
+                located.single.clear();
+            }
+        }
+        let alone = mode == Mode::Both && located.single.is_empty();
+        whole.absorb(run(session, folder, what, (name, target), (alone, true), &mut located)?);
         let images = with_estimated_cameras(&folder.images, located.set.as_ref());
         if let Some(images) = images {
             let calibrated = ImageFolder { images, ..folder.clone() };
@@ -126,14 +136,36 @@ pub fn locate(
     Ok(located)
 }
 
+/// Whether an image's camera is a guess that fewer than [`MIN_PHOTOS`] images share.
+fn is_lone_guess(images: &[SourceImage], image: &SourceImage) -> bool {
+    let alike = images.iter().filter(|other| other.is_guess(&image.camera)).count();
+    image.calibration == Calibration::Guessed && alike < MIN_PHOTOS
+}
+
+/// Puts what photos that are localized alone tell of their cameras in place of guesses that few photos share.
+///
+/// Such a camera has but what its own photos show to be estimated from, and along a street photos among themselves tell
+/// focal lengths poorly: a longer one and a step ahead look much the same.
+fn improve_lone_guesses(images: &mut [SourceImage], alone: &[PhotoLocalization]) {
+    let is_lone: Vec<bool> = images.iter().map(|image| is_lone_guess(images, image)).collect();
+    for (image, _) in images.iter_mut().zip(is_lone).filter(|(_, is_lone)| *is_lone) {
+        let tells =
+            |photo: &&PhotoLocalization| photo.verdict == Verdict::Localized && photo.name == image.name;
+        if let Some(photo) = alone.iter().find(tells) {
+            image.camera.clone_from(&photo.camera);
+        }
+    }
+}
+
 /// The images with the cameras that a set's localization tells in place of guessed ones; `None` when it tells none.
 ///
 /// Photos of one guess have one camera: that of the component in which most scene points place localized photos of
-/// theirs, else photos whose pose is uncertain.
+/// theirs, else photos whose pose is uncertain. One that few photos tell replaces the guess and is a guess itself: what
+/// the local model shows of it counts as well.
 fn with_estimated_cameras(images: &[SourceImage], set: Option<&SetLocalization>) -> Option<Vec<SourceImage>> {
     let placed: BTreeMap<&str, &PhotoLocalization> = set?.refined.iter().map(|p| (&*p.name, p)).collect();
     let told = |guess: &Camera| {
-        let mut support: Vec<(&Camera, [usize; 2])> = Vec::new();
+        let mut support: Vec<(&Camera, [usize; 2], usize)> = Vec::new();
         let alike = images.iter().filter(|image| image.is_guess(guess));
         for photo in alike.filter_map(|image| placed.get(&*image.name)) {
             let [localized, uncertain] = match photo.verdict {
@@ -141,18 +173,29 @@ fn with_estimated_cameras(images: &[SourceImage], set: Option<&SetLocalization>)
                 Verdict::Uncertain => [0, photo.inliers],
                 Verdict::NotLocalized => continue,
             };
-            let known = support.iter().position(|(camera, _)| **camera == photo.camera);
+            let known = support.iter().position(|(camera, ..)| **camera == photo.camera);
             let at = known.unwrap_or(support.len());
             if known.is_none() {
-                support.push((&photo.camera, [0; 2]));
+                support.push((&photo.camera, [0; 2], 0));
             }
             support[at].1[0] += localized;
             support[at].1[1] += uncertain;
+            support[at].2 += 1;
         }
-        let best = support.into_iter().max_by_key(|(_, points)| *points);
-        best.map(|(camera, _)| camera.clone().with_tangential_distortion())
+        let (camera, _, photos) = support.into_iter().max_by_key(|(_, points, _)| *points)?;
+        let calibration = if photos < MIN_PHOTOS { Calibration::Guessed } else { Calibration::Estimated };
+        Some((camera.clone().with_tangential_distortion(), calibration))
     };
-    with_told_cameras(images, Calibration::Estimated, told)
+    with_told_cameras(images, told)
+}
+
+/// Photos that tell a camera well enough for models of photos to take it as it is.
+const MIN_PHOTOS: usize = 3;
+
+/// Whether the scene has still to tell what cameras these are.
+fn are_untold(images: &[SourceImage]) -> bool {
+    let is_told = |image: &SourceImage| image.camera_origin == CameraOrigin::Estimated;
+    !images.iter().all(|image| image.calibration.is_settled()) && !images.iter().any(is_told)
 }
 
 /// Runs one graph: each photo alone, the set, or both.
@@ -210,7 +253,7 @@ impl LocateGraph<'_> {
         let mut graph = JobGraph::default();
         let jobs = if as_set {
             let mut what = what.clone();
-            if !folder.images.iter().all(|image| image.calibration.is_settled()) {
+            if are_untold(&folder.images) {
                 // What this tells of the cameras is for locating it again; what needs them well is left for then.
                 what.config.alignment.enabled = false;
                 what.config.sfm.continue_planes = false;
@@ -279,7 +322,6 @@ pub fn grow(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::CameraOrigin;
 
     #[test]
     fn guessed_cameras_become_those_that_most_of_the_scene_tells() {
@@ -316,10 +358,10 @@ mod tests {
             let images = with_estimated_cameras(&images, Some(&set))?;
             assert_eq!((&images[4].camera, images[4].calibration), (&known, Calibration::Known));
             let same = |image: &SourceImage| {
-                image.camera == images[0].camera && image.calibration == Calibration::Estimated
+                (&image.camera, image.calibration) == (&images[0].camera, images[0].calibration)
             };
             assert!(images[..4].iter().all(same));
-            Some(images[0].camera.focal_length())
+            Some((images[0].camera.focal_length(), images[0].calibration))
         };
         let by_two = vec![
             photo("a", 1500.0, 60, Localized),
@@ -327,12 +369,52 @@ mod tests {
             photo("c", 1200.0, 20, Localized),
             photo("d", 900.0, 500, Uncertain),
         ];
-        assert_eq!(told(by_two), Some(1200.0));
+        let by_three: Vec<_> =
+            by_two.iter().cloned().chain([photo("a", 1200.0, 9, Localized)]).skip(1).collect();
+        assert_eq!(told(by_three), Some((1200.0, Calibration::Estimated)));
+        // What few photos tell is a guess still.
+        assert_eq!(told(by_two), Some((1200.0, Calibration::Guessed)));
         let uncertain = vec![photo("a", 1500.0, 9, Uncertain), photo("b", 1920.0, 0, NotLocalized)];
-        assert_eq!(told(uncertain), Some(1500.0));
+        assert_eq!(told(uncertain), Some((1500.0, Calibration::Guessed)));
         assert_eq!(told(vec![photo("a", 1500.0, 0, NotLocalized)]), None);
         assert_eq!(told(vec![photo("k", 1111.0, 99, Localized)]), None);
         assert!(with_estimated_cameras(&images, None).is_none());
+    }
+
+    #[test]
+    fn what_a_photo_alone_tells_of_its_camera_replaces_a_guess_that_few_share() {
+        let image = |name: &str, width: u32| SourceImage {
+            name: name.to_owned(),
+            path: std::path::PathBuf::new(),
+            hash: ContentHash::of(name.as_bytes()),
+            camera: Camera::from_focal_guess(width, 1200, 1.2 * f64::from(width)),
+            calibration: Calibration::Guessed,
+            camera_origin: CameraOrigin::Listed,
+            position: None,
+            mask: None,
+        };
+        let photo = |name: &str, width: u32, verdict| PhotoLocalization {
+            name: name.to_owned(),
+            camera: Camera::from_focal_guess(width, 1200, 1000.0),
+            component: 0,
+            world_from_camera: None,
+            covariance: None,
+            inliers: 40,
+            verdict,
+            reasons: Vec::new(),
+        };
+        let mut images: Vec<SourceImage> = [("a", 1600), ("b", 1600), ("c", 1600), ("d", 1280), ("e", 1920)]
+            .map(|(n, w)| image(n, w))
+            .into();
+        let alone = [
+            photo("a", 1600, Verdict::Localized),
+            photo("d", 1280, Verdict::Localized),
+            photo("e", 1920, Verdict::Uncertain),
+        ];
+        improve_lone_guesses(&mut images, &alone);
+        let focal: Vec<f64> = images.iter().map(|image| image.camera.focal_length()).collect();
+        assert_eq!(focal, [1920.0, 1920.0, 1920.0, 1000.0, 2304.0]);
+        assert!(are_untold(&images));
     }
 
     #[test]

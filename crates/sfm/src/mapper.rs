@@ -2,6 +2,7 @@
 
 mod adjust;
 mod ambiguity;
+mod calibration;
 pub(crate) mod continuation;
 mod corner;
 mod correspondence;
@@ -29,7 +30,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, ImageFeatures, Match};
 
-pub(crate) use self::adjust::MIN_ADJUSTABLE_POINTS;
+pub(crate) use self::adjust::{MIN_ADJUSTABLE_POINTS, MIN_CALIBRATING_POINTS};
 pub(crate) use self::corner::ln_false_alarms;
 pub use self::{
     merge::{MergeRecord, MergeVerdict},
@@ -39,6 +40,7 @@ pub use self::{
 use self::{
     adjust::{Scope, adjust, is_adjustable},
     ambiguity::settle_pose,
+    calibration::calibrate,
     continuation::{Continued, continue_planes},
     correspondence::CorrespondenceGraph,
     model::Model,
@@ -60,7 +62,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 27;
+pub const MAPPER_VERSION: u32 = 28;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -478,6 +480,10 @@ struct Mapper<'a> {
     /// Images of earlier components.
     taken: Vec<bool>,
     anchors: Anchors,
+    /// 2D-to-3D matches that an image had when its camera was last sought.
+    calibrated_at: Vec<usize>,
+    /// Cameras that were found so before any of their images was registered: the pairs were verified with worse ones.
+    recalibrated: Vec<bool>,
     /// 2D-to-3D matches that an image had when it was last refused.
     refused_at: Vec<usize>,
     /// Points that a registered image had when the baseline of a pair (by index) was last sought.
@@ -515,6 +521,8 @@ impl<'a> Mapper<'a> {
             enabled,
             taken,
             anchors: vec![None; input.images.len()],
+            calibrated_at: vec![0; input.images.len()],
+            recalibrated: vec![false; input.cameras.len()],
             refused_at: vec![0; input.images.len()],
             baseline_tried: BTreeMap::new(),
             planes_tried: BTreeMap::new(),
@@ -601,6 +609,7 @@ impl<'a> Mapper<'a> {
 
     /// Registers the image whose points in the model support its pose best.
     fn register_next(&mut self) -> Option<ImageId> {
+        self.calibrate_waiting();
         let (image, hypothesis) = self.next_image()?;
         register(&mut self.model, image, &hypothesis);
         Some(image)
@@ -720,6 +729,35 @@ impl<'a> Mapper<'a> {
             is_open.then_some(Edge { pair: index, image, other, image_from_other })
         };
         self.model.input.pairs.iter().enumerate().filter_map(open).collect()
+    }
+
+    /// Finds the intrinsics of unknown cameras that no registered image has, where a waiting image tells them.
+    fn calibrate_waiting(&mut self) {
+        let camera_of = |image: ImageId| self.model.input.images[image.index()].camera.index();
+        let mut is_settled = self.model.input.camera_fixed.clone();
+        self.model.registered().for_each(|image| is_settled[camera_of(image)] = true);
+        if !is_settled.contains(&false) {
+            return;
+        }
+        for image in (0..self.model.poses.len() as u32).map(ImageId) {
+            let camera = self.model.input.images[image.index()].camera.index();
+            if self.taken[image.index()] || is_settled[camera] {
+                continue;
+            }
+            let count = count_scene_matches(&self.model, &self.graph, image);
+            let tried = &mut self.calibrated_at[image.index()];
+            if count < self.params.min_registration_inliers || count <= *tried * 11 / 10 {
+                continue;
+            }
+            *tried = count;
+            let seed = self.seed ^ (u64::from(image.0) << 32);
+            if let Some(found) = calibrate(&self.model, &self.graph, image, &self.params.ransac(), seed) {
+                self.model.cameras[camera] = found;
+                self.model.refresh_rays(camera);
+                self.recalibrated[camera] = true;
+                is_settled[camera] = true;
+            }
+        }
     }
 
     fn place_by_turn(&mut self, image: ImageId) {
@@ -852,8 +890,12 @@ impl<'a> Mapper<'a> {
     /// Share of an image's verified matches to registered images that belong to pairs whose rotation agrees with a pose.
     ///
     /// Resection from a few points in one corner, or on one plane, can settle on a pose far from the true one; the
-    /// essential matrices of the same image rarely share that error.
+    /// essential matrices of the same image rarely share that error. Those of a camera that was found since have another
+    /// error, and are not asked.
     fn pair_agreement(&self, image: ImageId, world_from_camera: &Rigid) -> f64 {
+        if self.recalibrated[self.model.input.images[image.index()].camera.index()] {
+            return 1.0;
+        }
         let (mut agreeing, mut all) = (0, 0);
         for pair in self.model.input.pairs {
             let Some((other, measured)) = pair.seen_from(image) else { continue };

@@ -228,6 +228,50 @@ fn a_facade_that_stands_twice_does_not_fold_the_street() {
 }
 
 #[test]
+fn a_camera_that_one_photo_has_is_found() {
+    // Photos of one phone, and the last by a surveillance camera: 5 m up, wider, strongly distorted.
+    let radial = |width: u32, height: u32, focal: f64, k: [f64; 2]| Camera {
+        model: CameraModel::Radial,
+        width,
+        height,
+        params: vec![focal, f64::from(width) / 2.0, f64::from(height) / 2.0, k[0], k[1]],
+    };
+    let phone = radial(1600, 1200, 1250.0, [0.0, 0.0]);
+    let other = radial(1280, 720, 700.0, [-0.25, 0.06]);
+    let views = (0..9).map(|k| {
+        let last = k == 8;
+        let tilt = if last { -0.3 } else { 0.0 };
+        let turn = UnitQuaternion::from_euler_angles(tilt, -0.7 + 0.09 * f64::from(k), 0.0);
+        let center = Vector3::new(1.0, if last { -3.0 } else { 0.0 }, 10.0 + 1.5 * f64::from(k));
+        (if last { other.clone() } else { phone.clone() }, Rigid::new(turn, center))
+    });
+    let street = Street::new(views.collect(), 0.3, 0, 8);
+    let mut guesses = street.cameras.clone();
+    guesses[8] = Camera::from_focal_guess(1280, 720, 1.2 * 1280.0);
+    let images = street.features.iter().zip(&street.names).enumerate();
+    let images =
+        images.map(|(at, (features, name))| InputImage::new(name, CameraId(u32::from(at == 8)), features));
+    let pairs = street.verified_pairs(&guesses);
+    let input = MapperInput {
+        cameras: vec![guesses[0].clone(), guesses[8].clone()],
+        camera_fixed: vec![true, false],
+        images: images.collect(),
+        pairs: &pairs,
+        putative: &[],
+        two_view: TwoViewParams::default(),
+    };
+    let output = reconstruct(&MapperParams::default(), &input, 5);
+    let (registered, worst_m, _) = street.errors(&output);
+    // All centres but one lie on a line. The principal point, known to 6 px, turns this camera by 0.5°.
+    let worst_deg = street.relative_rotation_error_deg(&output);
+    assert_eq!(registered, 9, "{:?}", output.report.registrations);
+    assert!(worst_m < 0.05 && worst_deg < 0.5, "{worst_m} m {worst_deg} deg");
+    let found = &output.components[0].cameras[1];
+    assert!((found.focal_length() / 700.0 - 1.0).abs() < 0.01, "{found:?}");
+    assert!((found.params[3] + 0.25).abs() < 0.03, "{found:?}");
+}
+
+#[test]
 fn the_unknown_focal_length_and_distortion_of_photos_are_found() {
     let truth = Camera {
         model: CameraModel::SimpleRadial,

@@ -97,6 +97,18 @@ impl Camera {
         Self { model: CameraModel::Radial, width, height, params }
     }
 
+    /// The same camera with its focal length (or lengths) multiplied.
+    #[must_use]
+    pub fn with_focal_times(&self, factor: f64) -> Self {
+        let mut scaled = self.clone();
+        for (value, role) in scaled.params.iter_mut().zip(self.param_roles()) {
+            if *role == ParamRole::Focal {
+                *value *= factor;
+            }
+        }
+        scaled
+    }
+
     /// The same camera as `OPENCV`, with two focal lengths and tangential distortion; only of radial models.
     #[must_use]
     pub fn with_tangential_distortion(self) -> Self {

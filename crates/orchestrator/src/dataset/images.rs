@@ -42,29 +42,27 @@ impl SourceImage {
     }
 }
 
-/// The images with the cameras that are told in place of guessed ones, which become `calibration`; `None` when none is
+/// The images with the cameras that are told in place of guessed ones, known as well as is told; `None` when none is
 /// told.
 pub fn with_told_cameras(
     images: &[SourceImage],
-    calibration: Calibration,
-    told: impl Fn(&Camera) -> Option<Camera>,
+    told: impl Fn(&Camera) -> Option<(Camera, Calibration)>,
 ) -> Option<Vec<SourceImage>> {
-    let mut known: Vec<(&Camera, Option<Camera>)> = Vec::new();
+    let mut known: Vec<(&Camera, Option<(Camera, Calibration)>)> = Vec::new();
     for image in images.iter().filter(|image| image.calibration == Calibration::Guessed) {
         if known.iter().all(|(guess, _)| **guess != image.camera) {
             known.push((&image.camera, told(&image.camera)));
         }
     }
     let with_camera = |image: &SourceImage| {
-        let found =
-            known.iter().find(|(guess, _)| image.is_guess(guess)).and_then(|(_, camera)| camera.clone());
+        let found = known.iter().find(|(guess, _)| image.is_guess(guess)).and_then(|(_, told)| told.clone());
         let camera_origin = CameraOrigin::Estimated;
         found.map_or_else(
             || image.clone(),
-            |camera| SourceImage { camera, calibration, camera_origin, ..image.clone() },
+            |(camera, calibration)| SourceImage { camera, calibration, camera_origin, ..image.clone() },
         )
     };
-    known.iter().any(|(_, camera)| camera.is_some()).then(|| images.iter().map(with_camera).collect())
+    known.iter().any(|(_, told)| told.is_some()).then(|| images.iter().map(with_camera).collect())
 }
 
 /// Where an image's camera comes from.

@@ -56,6 +56,16 @@ pub(super) fn is_adjustable(model: &Model<'_>, image: ImageId) -> bool {
     model.observed_points(image) >= MIN_ADJUSTABLE_POINTS
 }
 
+/// Points, each seen by two other images, that make a single image tell the intrinsics of its camera.
+pub(crate) const MIN_CALIBRATING_POINTS: usize = 30;
+
+/// Whether the images of a camera tell its intrinsics: several do, and one that sees enough of what others hold.
+fn tells_camera(model: &Model<'_>, images: &[ImageId]) -> bool {
+    let &[image] = images else { return !images.is_empty() };
+    let is_held = |&&(_, id): &&(u32, PointId)| model.point(id).is_some_and(|point| point.track.len() >= 3);
+    model.observations_of(image).iter().filter(is_held).count() >= MIN_CALIBRATING_POINTS
+}
+
 /// Bundle-adjusts `scope` and writes the result back.
 ///
 /// When every registered image is free the first one is held, which fixes six of the seven gauge freedoms; scale is
@@ -77,11 +87,7 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
     }
     if scope.intrinsics {
         for (camera, &fixed) in model.input.camera_fixed.iter().enumerate() {
-            let users = model
-                .registered()
-                .filter(|image| model.input.images[image.index()].camera.index() == camera)
-                .count();
-            if !fixed && users >= 2 {
+            if !fixed && tells_camera(model, &model.registered_with(camera)) {
                 problem.camera_freedom[camera] = IntrinsicsFreedom::FREE;
                 let usual = CameraPrior::of_usual_photo(camera as u32, &model.cameras[camera]);
                 problem.camera_priors.extend(usual);

@@ -157,6 +157,11 @@ impl<'a> Model<'a> {
         (0..self.poses.len() as u32).map(ImageId).filter(|&image| self.is_registered(image))
     }
 
+    /// The registered images of a camera, by its index.
+    pub fn registered_with(&self, camera: usize) -> Vec<ImageId> {
+        self.registered().filter(|image| self.input.images[image.index()].camera.index() == camera).collect()
+    }
+
     pub fn registered_count(&self) -> usize {
         self.poses.iter().flatten().count()
     }

@@ -72,7 +72,11 @@ pub(super) fn count_scene_matches(model: &Model<'_>, graph: &CorrespondenceGraph
 }
 
 /// 2D-to-3D matches of an unregistered image through its verified pairs.
-fn scene_matches(model: &Model<'_>, graph: &CorrespondenceGraph, image: ImageId) -> Vec<(u32, PointId)> {
+pub(super) fn scene_matches(
+    model: &Model<'_>,
+    graph: &CorrespondenceGraph,
+    image: ImageId,
+) -> Vec<(u32, PointId)> {
     let mut matches = Vec::new();
     for feature in 0..model.input.images[image.index()].features.len() as u32 {
         let start = matches.len();
