@@ -384,16 +384,32 @@ fn place(
         return;
     };
     component.transform(&placed.enu_from_world);
-    for (image, distance, agrees) in &placed.residuals {
-        if !agrees {
-            let name = &component.images[image.index()].name;
-            report
-                .warnings
-                .push(format!("the measured position of {name} is {distance:.1} m off and was not used"));
-        }
-    }
+    let name = |image: ImageId| component.images[image.index()].name.as_str();
+    let apart = placed.residuals.iter().filter(|(.., agrees)| !agrees);
+    let apart: Vec<(&str, f64)> = apart.map(|&(image, distance, _)| (name(image), distance)).collect();
+    report.warnings.extend(contradicted_positions(&apart, placed.residuals.len()));
     report.georegistrations.push(Some(placed));
 }
+
+/// Says which of `count` measured positions disagree with a model, by how many metres; where many do, that it may be the
+/// model that is wrong.
+fn contradicted_positions(apart: &[(&str, f64)], count: usize) -> Vec<String> {
+    if apart.len() < MANY_APART || 4 * apart.len() < count {
+        let unused = |(name, metres): &(&str, f64)| {
+            format!("the measured position of {name} is {metres:.1} m off and was not used")
+        };
+        return apart.iter().map(unused).collect();
+    }
+    let each: Vec<String> = apart.iter().map(|(name, metres)| format!("{name} ({metres:.1} m)")).collect();
+    vec![format!(
+        "{} of {count} measured positions contradict the model and were not used: it is folded, as where buildings repeat, or they are wrong: {}",
+        apart.len(),
+        each.join(", ")
+    )]
+}
+
+/// Contradicting positions, a quarter of all at least, that cast doubt on a model.
+const MANY_APART: usize = 3;
 
 /// Stands for an image's name inside models, so that a renamed image leaves them as they are.
 fn place_holder(at: usize) -> String {
@@ -423,6 +439,20 @@ pub(super) fn with_names(text: &str, names: &[String]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn many_positions_that_contradict_a_model_cast_doubt_on_it() {
+        let apart = [("a", 12.0), ("b", 16.06), ("c", 8.0)];
+        let few = contradicted_positions(&apart[..2], 4);
+        assert_eq!(few.len(), 2);
+        assert_eq!(few[1], "the measured position of b is 16.1 m off and was not used");
+        assert_eq!(contradicted_positions(&apart, 13).len(), 3);
+        let many = contradicted_positions(&apart, 12);
+        assert_eq!(many.len(), 1);
+        assert!(many[0].starts_with("3 of 12 measured positions contradict the model"), "{many:?}");
+        assert!(many[0].ends_with("a (12.0 m), b (16.1 m), c (8.0 m)"), "{many:?}");
+        assert!(contradicted_positions(&[], 5).is_empty());
+    }
 
     #[test]
     fn place_holders_become_names() {
