@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::{Matrix6, Vector3};
-use setloc_features::Camera;
+use setloc_features::{Camera, CameraModel};
 use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::robust::{RansacParams, estimate_absolute_pose};
 use setloc_sfm::{ImageId, Rigid};
@@ -17,6 +17,10 @@ use crate::{PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization
 const SAMPLE: usize = 3;
 /// Factors on a guessed focal length, tried in turn where the intrinsics are not known.
 const FOCAL_FACTORS: [f64; 7] = [1.0, 0.84, 1.19, 0.71, 1.41, 0.56, 1.78];
+
+/// How many times better a fisheye has to explain the matches than a lens without: it has two more terms, and a
+/// few matches more or less agree with any.
+const FISHEYE_GAIN: f64 = 1.1;
 
 /// A pose of one photo with everything that speaks for it.
 struct SinglePose {
@@ -112,18 +116,9 @@ fn solve(
     matches: &[SceneMatch],
     seed: u64,
 ) -> Option<SinglePose> {
-    let best = best_hypothesis(params, scene, photo, matches, seed)?;
-    let mut model = JointModel {
-        cameras: vec![best.camera],
-        camera_fixed: vec![photo.calibration.is_settled()],
-        photos: vec![JointPhoto { camera: 0, world_from_camera: best.pose, standpoint: 0 }],
-        points: Vec::new(),
-        lengths: Vec::new(),
-    };
-    refine(&mut model, scene, photo, matches, params.max_error_sigmas, false);
+    let Fit { mut model, agreeing, .. } = fit(params, scene, photo, matches, seed)?;
     let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
-    let agreeing = inliers(&rays, scene.index, &pose, matches, params.max_error_sigmas);
     let depth =
         median(agreeing.iter().map(|m| (scene.index.position(m.point) - pose.translation).norm()).collect())?;
     let rest: Vec<SceneMatch> = matches.iter().copied().filter(|m| !agreeing.contains(m)).collect();
@@ -166,6 +161,63 @@ fn solve(
     let rays = PhotoRays::new(photo.features, &camera);
     let inliers = inliers(&rays, scene.index, &pose, &candidates, params.max_error_sigmas);
     Some(SinglePose { camera, world_from_camera: pose, covariance, inliers, depth, evidence })
+}
+
+/// Camera and pose of one photo by its matches.
+struct Fit {
+    model: JointModel,
+    agreeing: Vec<SceneMatch>,
+    score: f64,
+}
+
+/// Camera and pose by the matches.
+///
+/// Where the intrinsics are not known, a wide lens is taken for a fisheye if that explains clearly more.
+fn fit(
+    params: &SingleParams,
+    scene: &Scene<'_>,
+    photo: &QueryPhoto<'_>,
+    matches: &[SceneMatch],
+    seed: u64,
+) -> Option<Fit> {
+    let refined = |camera: Camera, pose: Rigid| {
+        let mut model = JointModel {
+            cameras: vec![camera],
+            camera_fixed: vec![photo.calibration.is_settled()],
+            photos: vec![JointPhoto { camera: 0, world_from_camera: pose, standpoint: 0 }],
+            points: Vec::new(),
+            lengths: Vec::new(),
+        };
+        refine(&mut model, scene, photo, matches, params.max_error_sigmas, false);
+        let rays = PhotoRays::new(photo.features, &model.cameras[0]);
+        let pose = model.photos[0].world_from_camera;
+        let agreeing = inliers(&rays, scene.index, &pose, matches, params.max_error_sigmas);
+        let score = score(params, scene.index, &rays, &pose, matches);
+        Fit { model, agreeing, score }
+    };
+    let of_lens = |cameras: &[Camera], seed: u64| {
+        let best = best_hypothesis(params, scene, photo, cameras, matches, seed)?;
+        Some(refined(best.camera, best.pose))
+    };
+    if photo.calibration.is_settled() {
+        return of_lens(std::slice::from_ref(photo.camera), seed);
+    }
+    let likely: Vec<Camera> =
+        FOCAL_FACTORS.iter().map(|&factor| photo.camera.with_focal_times(factor)).collect();
+    let usual = of_lens(&likely, seed);
+    if photo.camera.model != CameraModel::Radial {
+        return usual;
+    }
+    let guesses: Vec<Camera> = Camera::fisheye_guesses(photo.camera.width, photo.camera.height).collect();
+    let bent = usual.as_ref().and_then(|usual| {
+        Some(refined(usual.model.cameras[0].as_fisheye()?, usual.model.photos[0].world_from_camera))
+    });
+    let fisheyes = [of_lens(&guesses, seed ^ 0xf15e), bent].into_iter().flatten();
+    let fisheye = fisheyes
+        .filter(|fit| fit.model.cameras[0].is_wide())
+        .max_by(|one, other| one.score.total_cmp(&other.score));
+    let score = |fit: &Option<Fit>| fit.as_ref().map_or(0.0, |fit| fit.score);
+    if score(&fisheye) > FISHEYE_GAIN * score(&usual) { fisheye } else { usual }
 }
 
 /// Refines the one photo of `model` on the matches that agree with it, twice, so that new inliers join.
@@ -213,13 +265,13 @@ pub(crate) fn union(first: &[SceneMatch], second: &[SceneMatch]) -> Vec<SceneMat
     all
 }
 
-/// The pose of greatest truncated score over all matches, from all of them and from covisible parts of them.
-///
-/// Focal lengths take the place of the parts where the intrinsics are not known.
+/// The pose of greatest truncated score over all matches: from all of them with each camera, where the intrinsics are
+/// known from covisible parts of them, too.
 fn best_hypothesis(
     params: &SingleParams,
     scene: &Scene<'_>,
     photo: &QueryPhoto<'_>,
+    cameras: &[Camera],
     matches: &[SceneMatch],
     seed: u64,
 ) -> Option<Hypothesis> {
@@ -227,14 +279,9 @@ fn best_hypothesis(
     if photo.calibration.is_settled() {
         subsets.extend(covisible_subsets(scene.index, matches, params.covisible_images));
     }
-    let cameras: Vec<Camera> = if photo.calibration.is_settled() {
-        vec![photo.camera.clone()]
-    } else {
-        FOCAL_FACTORS.iter().map(|&factor| photo.camera.with_focal_times(factor)).collect()
-    };
     let mut best: Option<Hypothesis> = None;
-    for (number, camera) in cameras.into_iter().enumerate() {
-        let rays = PhotoRays::new(photo.features, &camera);
+    for (number, camera) in cameras.iter().enumerate() {
+        let rays = PhotoRays::new(photo.features, camera);
         for (part, subset) in subsets.iter().enumerate() {
             let seed = seed.wrapping_add((number * 64 + part) as u64);
             let Some(pose) = estimate(params, scene.index, &rays, subset, seed) else { continue };
@@ -326,7 +373,7 @@ mod tests {
     use super::*;
     use setloc_features::Calibration;
 
-    use crate::synthetic::World;
+    use crate::synthetic::{World, along_street};
 
     fn locate(world: &World, photo: usize) -> PhotoLocalization {
         locate_single(&SingleParams::default(), &world.scene(), &world.queries()[photo], 3).photo
@@ -374,6 +421,30 @@ mod tests {
         assert!((found.camera.params[0] / 800.0 - 1.0).abs() < 0.01, "{:?}", found.camera.params);
         let (center, rotation) = world.errors(0, &found.world_from_camera.unwrap());
         assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
+    }
+
+    #[test]
+    fn an_unknown_fisheye_is_told_from_other_lenses() {
+        let place = crate::synthetic::Place::street(3500, 13);
+        let world = World::new(&place, &[], 0.2, 13);
+        let pose = along_street(Vector3::new(0.7, -1.5, 20.0), 0.05);
+        let photo = |camera: &Camera| {
+            let view = place.view(camera, pose, 0.2, 20, 13_200);
+            let guess = Camera::from_focal_guess(1200, 900, 1440.0);
+            let (name, calibration) = ("photo", Calibration::Guessed);
+            let query = QueryPhoto { name, camera: &guess, calibration, features: &view.features };
+            let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5).photo;
+            assert_eq!(found.verdict, Verdict::Localized, "{found:#?}");
+            let found_pose = found.world_from_camera.unwrap();
+            let off = (found_pose.translation - pose.translation).norm();
+            assert!(off < 0.1, "{off}");
+            found.camera
+        };
+        let params = vec![400.0, 400.0, 600.0, 450.0, 0.02, -0.005, 0.0, 0.0];
+        let wide = photo(&Camera { model: CameraModel::OpencvFisheye, width: 1200, height: 900, params });
+        assert_eq!(wide.model, CameraModel::OpencvFisheye);
+        assert!((wide.focal_length() / 400.0 - 1.0).abs() < 0.01, "{wide:?}");
+        assert_eq!(photo(&world.camera).model, CameraModel::Radial);
     }
 
     #[test]

@@ -161,7 +161,7 @@ fn improve_lone_guesses(images: &mut [SourceImage], alone: &[PhotoLocalization])
 ///
 /// Photos of one guess have one camera: that of the component in which most scene points place localized photos of
 /// theirs, else photos whose pose is uncertain. One that few photos tell replaces the guess and is a guess itself: what
-/// the local model shows of it counts as well.
+/// the local model shows of it counts as well. So is that of a wide lens, which may turn out to be a fisheye.
 fn with_estimated_cameras(images: &[SourceImage], set: Option<&SetLocalization>) -> Option<Vec<SourceImage>> {
     let placed: BTreeMap<&str, &PhotoLocalization> = set?.refined.iter().map(|p| (&*p.name, p)).collect();
     let told = |guess: &Camera| {
@@ -183,7 +183,8 @@ fn with_estimated_cameras(images: &[SourceImage], set: Option<&SetLocalization>)
             support[at].2 += 1;
         }
         let (camera, _, photos) = support.into_iter().max_by_key(|(_, points, _)| *points)?;
-        let calibration = if photos < MIN_PHOTOS { Calibration::Guessed } else { Calibration::Estimated };
+        let is_open = photos < MIN_PHOTOS || camera.may_be_fisheye();
+        let calibration = if is_open { Calibration::Guessed } else { Calibration::Estimated };
         Some((camera.clone().with_tangential_distortion(), calibration))
     };
     with_told_cameras(images, told)

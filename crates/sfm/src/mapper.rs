@@ -8,6 +8,7 @@ mod corner;
 mod correspondence;
 mod direction;
 mod initial;
+mod lens;
 mod merge;
 mod model;
 mod nearby;
@@ -43,6 +44,7 @@ use self::{
     calibration::calibrate,
     continuation::{Continued, continue_planes},
     correspondence::CorrespondenceGraph,
+    lens::choose_lenses,
     model::Model,
     projection::search_by_projection,
     register::{
@@ -62,7 +64,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 28;
+pub const MAPPER_VERSION: u32 = 29;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -976,6 +978,10 @@ impl<'a> Mapper<'a> {
 
     fn finish(&mut self) {
         self.refine(2, 20);
+        if choose_lenses(&mut self.model, self.params) {
+            self.refine(4, 20);
+            self.grow();
+        }
         // Whoever is taken out may find its right place in the finished surroundings.
         for _ in 0..3 {
             if self.expel_misplaced() == 0 {

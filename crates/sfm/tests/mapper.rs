@@ -227,17 +227,21 @@ fn a_facade_that_stands_twice_does_not_fold_the_street() {
     }
 }
 
-#[test]
-fn a_camera_that_one_photo_has_is_found() {
-    // Photos of one phone, and the last by a surveillance camera: 5 m up, wider, strongly distorted.
-    let radial = |width: u32, height: u32, focal: f64, k: [f64; 2]| Camera {
-        model: CameraModel::Radial,
-        width,
-        height,
-        params: vec![focal, f64::from(width) / 2.0, f64::from(height) / 2.0, k[0], k[1]],
-    };
+fn radial(width: u32, height: u32, focal: f64, k: [f64; 2]) -> Camera {
+    let params = vec![focal, f64::from(width) / 2.0, f64::from(height) / 2.0, k[0], k[1]];
+    Camera { model: CameraModel::Radial, width, height, params }
+}
+
+fn fisheye(width: u32, height: u32, focal: f64, k: [f64; 2]) -> Camera {
+    let (cx, cy) = (f64::from(width) / 2.0, f64::from(height) / 2.0);
+    let params = vec![focal, focal, cx, cy, k[0], k[1], 0.0, 0.0];
+    Camera { model: CameraModel::OpencvFisheye, width, height, params }
+}
+
+/// Photos of one phone whose intrinsics are known, and the last by a surveillance camera 5 m up of which nothing is known.
+/// Gives what is found of the latter.
+fn found_of_last(other: &Camera) -> Camera {
     let phone = radial(1600, 1200, 1250.0, [0.0, 0.0]);
-    let other = radial(1280, 720, 700.0, [-0.25, 0.06]);
     let views = (0..9).map(|k| {
         let last = k == 8;
         let tilt = if last { -0.3 } else { 0.0 };
@@ -247,7 +251,7 @@ fn a_camera_that_one_photo_has_is_found() {
     });
     let street = Street::new(views.collect(), 0.3, 0, 8);
     let mut guesses = street.cameras.clone();
-    guesses[8] = Camera::from_focal_guess(1280, 720, 1.2 * 1280.0);
+    guesses[8] = Camera::from_focal_guess(other.width, other.height, 1.2 * f64::from(other.width));
     let images = street.features.iter().zip(&street.names).enumerate();
     let images =
         images.map(|(at, (features, name))| InputImage::new(name, CameraId(u32::from(at == 8)), features));
@@ -265,35 +269,65 @@ fn a_camera_that_one_photo_has_is_found() {
     // All centres but one lie on a line. The principal point, known to 6 px, turns this camera by 0.5°.
     let worst_deg = street.relative_rotation_error_deg(&output);
     assert_eq!(registered, 9, "{:?}", output.report.registrations);
-    assert!(worst_m < 0.05 && worst_deg < 0.5, "{worst_m} m {worst_deg} deg");
-    let found = &output.components[0].cameras[1];
+    assert!(worst_m < 0.05 && worst_deg < 0.6, "{worst_m} m {worst_deg} deg");
+    output.components[0].cameras[1].clone()
+}
+
+#[test]
+fn a_camera_that_one_photo_has_is_found() {
+    let found = found_of_last(&radial(1280, 720, 700.0, [-0.25, 0.06]));
+    assert_eq!(found.model, CameraModel::Radial);
     assert!((found.focal_length() / 700.0 - 1.0).abs() < 0.01, "{found:?}");
     assert!((found.params[3] + 0.25).abs() < 0.03, "{found:?}");
 }
 
 #[test]
+fn a_fisheye_that_one_photo_has_is_found() {
+    let found = found_of_last(&fisheye(1280, 960, 420.0, [-0.01, 0.004]));
+    assert_eq!(found.model, CameraModel::OpencvFisheye);
+    assert!((found.focal_length() / 420.0 - 1.0).abs() < 0.01, "{found:?}");
+}
+
+/// What is found of the camera of nine photos, and how far the worst of them is off in metres.
+fn found_of_all(truth: &Camera, guess: &Camera) -> (Camera, f64) {
+    let views = (0..9).map(|k| {
+        let turn = UnitQuaternion::from_euler_angles(0.0, -0.7 + 0.09 * f64::from(k), 0.0);
+        let center = Vector3::new(3.0 - 0.7 * f64::from(k), 0.1 * f64::from(k % 3), f64::from(k));
+        (truth.clone(), Rigid::new(turn, center))
+    });
+    let street = Street::new(views.collect(), 0.3, 0, 3);
+    let output = street.map(&vec![guess.clone(); 9], false);
+    let (registered, worst_m, _) = street.errors(&output);
+    assert_eq!(registered, 9);
+    (output.components[0].cameras[0].clone(), worst_m)
+}
+
+#[test]
+fn photos_of_a_fisheye_that_was_taken_for_another_lens_show_it() {
+    let truth = fisheye(1600, 1200, 700.0, [0.03, -0.01]);
+    // What two radial terms make of it.
+    let (found, worst_m) = found_of_all(&truth, &radial(1600, 1200, 742.6, [-0.26, 0.06]));
+    assert_eq!(found.model, CameraModel::OpencvFisheye);
+    assert!((found.focal_length() / 700.0 - 1.0).abs() < 0.01, "{found:?}");
+    assert!(worst_m < 0.05, "{worst_m} m");
+    // As wide a lens that is none stays what it is.
+    let truth = radial(1600, 1200, 700.0, [-0.25, 0.06]);
+    let (found, worst_m) = found_of_all(&truth, &radial(1600, 1200, 900.0, [0.0, 0.0]));
+    assert_eq!(found.model, CameraModel::Radial);
+    assert!(worst_m < 0.05, "{worst_m} m");
+}
+
+#[test]
 fn the_unknown_focal_length_and_distortion_of_photos_are_found() {
-    let truth = Camera {
+    let simple = |focal: f64, k: f64| Camera {
         model: CameraModel::SimpleRadial,
         width: 1600,
         height: 1200,
-        params: vec![1250.0, 800.0, 600.0, -0.05],
+        params: vec![focal, 800.0, 600.0, k],
     };
-    let views = (0..9).map(|k| {
-        let turn = UnitQuaternion::from_euler_angles(0.0, -0.7 + 0.09 * f64::from(k), 0.0);
-        (
-            truth.clone(),
-            Rigid::new(turn, Vector3::new(3.0 - 0.7 * f64::from(k), 0.1 * f64::from(k % 3), f64::from(k))),
-        )
-    });
-    let street = Street::new(views.collect(), 0.3, 0, 3);
-    let guess = Camera { params: vec![1920.0, 800.0, 600.0, 0.0], ..truth.clone() };
-    let output = street.map(&vec![guess; 9], false);
-    let (registered, worst_m, _) = street.errors(&output);
-    let found = &output.components[0].cameras[0].params;
-    assert_eq!(registered, 9);
-    assert!((found[0] / truth.params[0] - 1.0).abs() < 0.01, "{found:?}");
-    assert!((found[3] - truth.params[3]).abs() < 0.01, "{found:?}");
+    let (found, worst_m) = found_of_all(&simple(1250.0, -0.05), &simple(1920.0, 0.0));
+    assert!((found.params[0] / 1250.0 - 1.0).abs() < 0.01, "{found:?}");
+    assert!((found.params[3] + 0.05).abs() < 0.01, "{found:?}");
     assert!(worst_m < 0.05, "{worst_m} m");
 }
 

@@ -8,7 +8,7 @@ mod paper_rectilinear;
 #[cfg(test)]
 mod tests;
 
-use nalgebra::{Matrix2x3, Matrix3x2, SMatrix, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3x2, SMatrix, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::FeatureError;
@@ -17,6 +17,15 @@ pub use model::{CameraModel, ParamRole};
 
 /// The most intrinsic parameters any model has.
 pub const MAX_CAMERA_PARAMS: usize = 8;
+
+/// Focal lengths of [`Camera::fisheye_guesses`] in units of the longer side.
+const FISHEYE_FOCALS: [f64; 7] = [0.2, 0.24, 0.29, 0.35, 0.42, 0.5, 0.6];
+
+/// Focal length in half diagonals of the image below which [`Camera::is_wide`].
+const WIDE: f64 = 1.0;
+
+/// Places along a lens's curve that [`Camera::as_fisheye`] compares.
+const CURVE_SAMPLES: usize = 64;
 
 /// A camera: model, image size and intrinsic parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -97,6 +106,40 @@ impl Camera {
         Self { model: CameraModel::Radial, width, height, params }
     }
 
+    /// Whether the image's diagonal shows more than some 90°, where fisheyes and other lenses differ by more than two
+    /// radial terms take up.
+    pub fn is_wide(&self) -> bool {
+        let half_diagonal = f64::from(self.width).hypot(f64::from(self.height)) / 2.0;
+        self.focal_length() < WIDE * half_diagonal
+    }
+
+    /// Whether this is a wide camera of which photos may yet show that it is a fisheye.
+    pub fn may_be_fisheye(&self) -> bool {
+        matches!(self.model, CameraModel::Radial | CameraModel::Opencv) && self.is_wide()
+    }
+
+    /// The fisheye, as `OPENCV_FISHEYE` with one distortion term, whose rays come next to this lens's where most of the
+    /// image is, up to 0.7 of the half diagonal; `None` of panoramas.
+    ///
+    /// Farther out few photos tell two radial terms, and there the two lenses differ.
+    pub fn as_fisheye(&self) -> Option<Self> {
+        let (_, k) = self.lens()?;
+        let farthest = 0.35 * f64::from(self.width).hypot(f64::from(self.height));
+        // r = a₀θ + a₁θ³
+        let (mut normal, mut right) = (Matrix2::zeros(), Vector2::zeros());
+        for radius in (1..=CURVE_SAMPLES).map(|step| farthest * step as f64 / CURVE_SAMPLES as f64) {
+            let Some(ray) = self.unproject(&(k.center + Vector2::new(radius, 0.0))) else { break };
+            let theta = ray.x.hypot(ray.y).atan2(ray.z);
+            let powers = Vector2::new(theta, theta.powi(3));
+            normal += powers * powers.transpose();
+            right += powers * radius;
+        }
+        let curve = normal.cholesky()?.solve(&right);
+        let params = vec![curve[0], curve[0], k.center.x, k.center.y, curve[1] / curve[0], 0.0, 0.0, 0.0];
+        let fisheye = Self { model: CameraModel::OpencvFisheye, params, ..*self };
+        fisheye.validate().is_ok().then_some(fisheye)
+    }
+
     /// The same camera with its focal length (or lengths) multiplied.
     #[must_use]
     pub fn with_focal_times(&self, factor: f64) -> Self {
@@ -107,6 +150,17 @@ impl Camera {
             }
         }
         scaled
+    }
+
+    /// What a fisheye photo may have been taken with: centred equidistant cameras as `OPENCV_FISHEYE`, each a fifth longer
+    /// than the one before, so that the longer side shows 287° to 96° (a circular image may be smaller than that).
+    pub fn fisheye_guesses(width: u32, height: u32) -> impl Iterator<Item = Self> {
+        let (cx, cy) = (f64::from(width) / 2.0, f64::from(height) / 2.0);
+        FISHEYE_FOCALS.into_iter().map(move |focal| {
+            let focal = focal * f64::from(width.max(height));
+            let params = vec![focal, focal, cx, cy, 0.0, 0.0, 0.0, 0.0];
+            Self { model: CameraModel::OpencvFisheye, width, height, params }
+        })
     }
 
     /// The same camera as `OPENCV`, with two focal lengths and tangential distortion; only of radial models.
@@ -180,7 +234,7 @@ impl Camera {
         if !pixel.iter().all(|value| value.is_finite()) {
             return None;
         }
-        let focal = nalgebra::Matrix2::from_diagonal(&k.focal);
+        let focal = Matrix2::from_diagonal(&k.focal);
         let mut canonical = SMatrix::<f64, 2, MAX_CAMERA_PARAMS>::zeros();
         canonical[(0, 0)] = distorted.point.x;
         canonical[(1, 1)] = distorted.point.y;

@@ -269,6 +269,31 @@ fn one_pixel_spans_the_expected_angle() {
 }
 
 #[test]
+fn a_fisheye_follows_another_lens_where_most_of_the_image_is() {
+    let params = vec![722.0, 722.0, 817.0, 590.0, -0.25, 0.05, 0.0, 0.0];
+    let lens = Camera { model: CameraModel::Opencv, width: 1600, height: 1200, params };
+    let fisheye = lens.as_fisheye().unwrap();
+    assert_eq!(fisheye.model, CameraModel::OpencvFisheye);
+    for pixel in [(817.0, 590.0), (1200.0, 300.0), (900.0, 1190.0), (300.0, 600.0)] {
+        let pixel = Vector2::new(pixel.0, pixel.1);
+        let off = angle(&lens.unproject(&pixel).unwrap(), &fisheye.unproject(&pixel).unwrap());
+        assert!(off < 0.01, "{pixel:?}: {off} rad");
+    }
+    assert!(lens.may_be_fisheye() && !fisheye.may_be_fisheye());
+    assert!(!Camera::from_focal_guess(1600, 1200, 1165.0).may_be_fisheye());
+    assert_eq!(Camera::equirectangular(200, 100).as_fisheye(), None);
+}
+
+#[test]
+fn one_fisheye_guess_is_within_a_tenth_of_any_focal_length() {
+    let focals: Vec<f64> =
+        Camera::fisheye_guesses(900, 1200).map(|camera| camera.focal_length() / 1200.0).collect();
+    assert!(focals[0] <= 0.2 && focals[6] >= 0.6);
+    assert!(focals.windows(2).all(|two| (1.0..1.22).contains(&(two[1] / two[0]))), "{focals:?}");
+    assert!(Camera::fisheye_guesses(900, 1200).all(|camera| camera.validate().is_ok()));
+}
+
+#[test]
 fn directions_far_off_the_axis_survive_a_round_trip() {
     for camera in cameras() {
         for z in [1e-1, 1e-2, 1e-3, 4e-4, 1e-4] {

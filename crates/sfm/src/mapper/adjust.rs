@@ -60,10 +60,9 @@ pub(super) fn is_adjustable(model: &Model<'_>, image: ImageId) -> bool {
 pub(crate) const MIN_CALIBRATING_POINTS: usize = 30;
 
 /// Whether the images of a camera tell its intrinsics: several do, and one that sees enough of what others hold.
-fn tells_camera(model: &Model<'_>, images: &[ImageId]) -> bool {
+pub(super) fn tells_camera(model: &Model<'_>, images: &[ImageId]) -> bool {
     let &[image] = images else { return !images.is_empty() };
-    let is_held = |&&(_, id): &&(u32, PointId)| model.point(id).is_some_and(|point| point.track.len() >= 3);
-    model.observations_of(image).iter().filter(is_held).count() >= MIN_CALIBRATING_POINTS
+    model.placed_by_others(image).len() >= MIN_CALIBRATING_POINTS
 }
 
 /// Bundle-adjusts `scope` and writes the result back.

@@ -11,7 +11,7 @@ use super::{
     structure::{filter, triangulate_image},
 };
 use crate::{
-    ImageId, Observation, PointId, Rigid,
+    ImageId, Observation, Rigid,
     robust::{RansacParams, rival_poses},
 };
 
@@ -68,7 +68,7 @@ fn rivals(
 ) -> Vec<Rigid> {
     let rays = &model.rays[image.index()];
     let (mut bearings, mut sigmas, mut points) = (Vec::new(), Vec::new(), Vec::new());
-    let known = placed_by_others(model, image);
+    let known = model.placed_by_others(image);
     for (feature, id) in known.iter().step_by(known.len().div_ceil(MOST_POINTS).max(1)).copied() {
         if let Some(point) = model.point(id) {
             bearings.push(rays.bearings[feature as usize]);
@@ -84,13 +84,6 @@ fn rivals(
     rival_poses(&params, &bearings, &sigmas, &points, current, seed ^ (u64::from(image.0) << 32))
 }
 
-/// The observations of points that two further images see, so that they have a place without this one.
-fn placed_by_others(model: &Model<'_>, image: ImageId) -> Vec<(u32, PointId)> {
-    let mut observations = model.observations_of(image);
-    observations.retain(|(_, id)| model.point(*id).is_some_and(|point| point.track.len() > 2));
-    observations
-}
-
 /// The model with an image at this pose, adjusted with all that it sees from there.
 fn moved_to<'a>(
     model: &Model<'a>,
@@ -100,7 +93,7 @@ fn moved_to<'a>(
     pose: &Rigid,
 ) -> Model<'a> {
     let mut trial = model.clone();
-    let inliers = placed_by_others(model, image);
+    let inliers = model.placed_by_others(image);
     trial.unregister(image);
     let candidates = inliers.len();
     let visibility = Visibility::default();

@@ -7,7 +7,11 @@
 use nalgebra::{Vector2, Vector3};
 use setloc_features::{Camera, CameraModel, Keypoint};
 
-use super::{correspondence::CorrespondenceGraph, model::Model, register::scene_matches};
+use super::{
+    correspondence::CorrespondenceGraph,
+    model::Model,
+    register::{hypothesize, scene_matches},
+};
 use crate::{
     ImageId, Rigid,
     bundle::{
@@ -53,28 +57,58 @@ pub(super) fn calibrate(
     let (keypoints, points): (Vec<&Keypoint>, Vec<Vector3<f64>>) = found.unzip();
     let seen = Seen { keypoints, points, max_error_sigma: params.max_error_sigma };
     let (camera, agreeing) = seen.calibrated(guess, params, seed)?;
-    let by_guess = seen.agreeing_with_guess(guess, params, seed);
+    let by_guess = hypothesize(model, graph, image, params, 1, seed);
+    let by_guess = by_guess.first().map_or(0, |hypothesis| hypothesis.inliers.len());
     (agreeing >= MIN_AGREEING && agreeing as f64 >= GAIN * by_guess as f64).then_some(camera)
 }
 
 impl Seen<'_> {
-    /// The camera and how many matches agree with it.
+    /// The camera and how many matches agree with it: a fisheye, where that explains clearly more.
     fn calibrated(&self, guess: &Camera, params: &RansacParams, seed: u64) -> Option<(Camera, usize)> {
+        let usual = self.rectilinear(guess, params, seed);
+        let fisheye = self.fisheye(guess, params, seed);
+        let support = |found: &Option<(_, usize)>| found.as_ref().map_or(0, |(_, agreeing)| *agreeing);
+        if support(&fisheye) as f64 > GAIN * support(&usual) as f64 { fisheye } else { usual }
+    }
+
+    /// A camera by focal length and pose in one.
+    fn rectilinear(&self, guess: &Camera, params: &RansacParams, seed: u64) -> Option<(Camera, usize)> {
         let center = Vector2::new(guess.params[1], guess.params[2]);
         let pixels: Vec<Vector2<f64>> = self.keypoints.iter().map(|seen| seen.pixel() - center).collect();
         let sigmas: Vec<f64> = self.keypoints.iter().map(|seen| f64::from(seen.noise_px)).collect();
         let side = f64::from(guess.width.max(guess.height));
         let range = (FOCAL_RANGE.0 * side, FOCAL_RANGE.1 * side);
         let found = estimate_absolute_pose_focal(params, &pixels, &sigmas, &self.points, range, seed)?;
-        let mut camera = guess.with_focal_times(found.focal / guess.focal_length());
-        let mut pose = found.world_from_camera;
-        let mut agreeing: Vec<usize> = found.inliers.iter().map(|&at| at as usize).collect();
+        let camera = guess.with_focal_times(found.focal / guess.focal_length());
+        let (camera, agreeing) = self.improved(camera, found.world_from_camera, found.inliers)?;
+        let focal = camera.focal_length();
+        (focal >= range.0 && focal <= range.1).then_some((camera, agreeing))
+    }
+
+    /// The fisheye that most matches agree with.
+    fn fisheye(&self, guess: &Camera, params: &RansacParams, seed: u64) -> Option<(Camera, usize)> {
+        let with_pose = |camera: Camera| {
+            let rays = self.keypoints.iter().map(|seen| {
+                let (bearing, angle) = camera.ray(&seen.pixel())?;
+                Some((bearing, angle * f64::from(seen.noise_px)))
+            });
+            let (bearings, sigmas): (Vec<_>, Vec<_>) = rays.collect::<Option<Vec<_>>>()?.into_iter().unzip();
+            let found = estimate_absolute_pose(params, &bearings, &sigmas, &self.points, seed)?;
+            Some((camera, found.world_from_camera, found.inliers))
+        };
+        let guesses = Camera::fisheye_guesses(guess.width, guess.height).filter_map(with_pose);
+        let (camera, pose, agreeing) = guesses.max_by_key(|(.., agreeing)| agreeing.len())?;
+        self.improved(camera, pose, agreeing)
+    }
+
+    /// Camera and pose, adjusted to what agrees until that is all that does, and how much it is.
+    fn improved(&self, mut camera: Camera, mut pose: Rigid, agreeing: Vec<u32>) -> Option<(Camera, usize)> {
+        let mut agreeing: Vec<usize> = agreeing.into_iter().map(|at| at as usize).collect();
         for _ in 0..ROUNDS {
             (camera, pose) = self.adjusted(&camera, &pose, &agreeing)?;
             agreeing = self.agreeing(&camera, &pose);
         }
-        let focal = camera.focal_length();
-        (focal >= range.0 && focal <= range.1).then_some((camera, agreeing.len()))
+        Some((camera, agreeing.len()))
     }
 
     /// Camera and pose adjusted to these matches, the points held.
@@ -108,15 +142,5 @@ impl Seen<'_> {
             (direction - bearing).norm() <= self.max_error_sigma * sigma
         };
         (0..self.points.len()).filter(agrees).collect()
-    }
-
-    fn agreeing_with_guess(&self, guess: &Camera, params: &RansacParams, seed: u64) -> usize {
-        let rays = self.keypoints.iter().zip(&self.points).filter_map(|(seen, &point)| {
-            let (bearing, angle) = guess.ray(&seen.pixel())?;
-            Some((bearing, (angle * f64::from(seen.noise_px), point)))
-        });
-        let (bearings, others): (Vec<_>, Vec<(f64, Vector3<f64>)>) = rays.unzip();
-        let (sigmas, points): (Vec<_>, Vec<_>) = others.into_iter().unzip();
-        estimate_absolute_pose(params, &bearings, &sigmas, &points, seed).map_or(0, |pose| pose.inliers.len())
     }
 }

@@ -313,6 +313,13 @@ impl<'a> Model<'a> {
         ids.filter(|&(_, &id)| id != NO_POINT).map(|(feature, &id)| (feature as u32, PointId(id))).collect()
     }
 
+    /// The observations of points that two further images see, so that they have a place without this one.
+    pub fn placed_by_others(&self, image: ImageId) -> Vec<(u32, PointId)> {
+        let mut observations = self.observations_of(image);
+        observations.retain(|(_, id)| self.point(*id).is_some_and(|point| point.track.len() > 2));
+        observations
+    }
+
     /// Number of points that an image sees much as a camera with its centre elsewhere would.
     pub fn points_seen_alike(&self, image: ImageId, center: &Vector3<f64>) -> usize {
         let Some(pose) = &self.poses[image.index()] else { return 0 };
