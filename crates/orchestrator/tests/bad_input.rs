@@ -108,3 +108,29 @@ fn wrong_values_in_cameras_json_are_named_with_their_line() {
     assert_eq!(output.status.code(), Some(2));
     assert!(text.contains("cameras.json") && text.contains("line 2") && text.contains("`PINHOLE`"), "{text}");
 }
+
+#[test]
+fn outputs_never_replace_what_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    let run = |arguments: &[&str]| setloc(folder.path(), arguments);
+    std::fs::write(folder.path().join("geo.csv"), "p0.png,47,8\n").unwrap();
+    assert_eq!(run(&["build", "panoramas", "-o", "s.setloc"]).status.code(), Some(1));
+    let commands: [&[&str]; 7] = [
+        &["build", "panoramas", "-o", "panoramas/p0.png"],
+        &["build", "panoramas", "--gps", "geo.csv", "-o", "geo.csv"],
+        &["export", "s.setloc", "--format", "json", "-o", "s.setloc"],
+        &["export", "s.setloc", "--format", "top-view", "-o", "panoramas/../s.setloc"],
+        &["report", "s.setloc", "-o", "s.setloc"],
+        &["report", "s", "-o", "s/poses.json"],
+        &["locate", "s.setloc", "panoramas", "--grow", "panoramas/p1.png"],
+    ];
+    for command in commands {
+        let output = command.last().unwrap();
+        let before = std::fs::read(folder.path().join(output)).unwrap();
+        let refused = run(command);
+        assert_eq!(refused.status.code(), Some(2), "{command:?}");
+        assert!(said(&refused).contains("is read, and would be replaced"), "{}", said(&refused));
+        assert!(std::fs::read(folder.path().join(output)).unwrap() == before, "{command:?}");
+    }
+}

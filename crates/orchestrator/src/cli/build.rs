@@ -10,6 +10,7 @@ use setloc_sfm::{ImageId, Reconstruction};
 
 use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
+use super::outputs::{PICTURE, refuse_image_folder, refuse_input};
 use crate::building::{BuildOutcome, Built, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras};
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images};
@@ -35,10 +36,11 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
         print::data(config.to_toml()?.trim_end());
         return Ok(Answer::Done);
     }
-    let folder = read_sources(&args.source)?;
     let output = &args.source.output;
     let export = args.export.clone().unwrap_or_else(|| export_folder(output));
-    refuse_input_folder(&args.source.panoramas, &export)?;
+    let files = list_sources(&args.source)?;
+    refuse_inputs(&args.source, &files, &export)?;
+    let folder = read_sources(&args.source, &files)?;
     let session = args.source.run.session(output, Some(&export))?;
     let name = session.store.name_of("build", output);
     let present = std::fs::read(output).ok().map(|bytes| ContentHash::of(&bytes));
@@ -90,7 +92,7 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
 /// `setloc plan`
 pub fn plan(args: &PlanArgs) -> Result<Answer> {
     let config = args.source.run.config()?;
-    let folder = read_sources(&args.source)?;
+    let folder = read_sources(&args.source, &list_sources(&args.source)?)?;
     let store = Store::at(&cache_folder(args.source.run.cache.as_deref(), &args.source.output));
     let name = store.name_of("build", &args.source.output);
     let alike = stored_alike_pairs(args, &folder, &config, (&store, &name))?;
@@ -173,17 +175,14 @@ fn next_jobs<'g>(
     Ok(graph)
 }
 
-/// What is exported beside images would be read as images by the next build.
-fn refuse_input_folder(inputs: &[PathBuf], export: &Path) -> Result<()> {
-    let Ok(export_at) = export.canonicalize() else { return Ok(()) };
-    let is_export = |input: &&PathBuf| input.canonicalize().is_ok_and(|input| input == export_at);
-    match inputs.iter().find(is_export) {
-        Some(input) => Err(Hinted::error(
-            format!("the exports would go into {}, among the images", input.display()),
-            "name the scene otherwise, or a folder for its exports with --export",
-        )),
-        None => Ok(()),
-    }
+/// Neither the scene nor what is exported may replace what the scene is made from.
+fn refuse_inputs(source: &SourceArgs, files: &[(String, PathBuf)], export: &Path) -> Result<()> {
+    let hint = "name the scene otherwise, or a folder for its exports with --export";
+    refuse_image_folder(&source.panoramas, export, hint)?;
+    let images = files.iter().map(|(_, path)| path.as_path());
+    let table = source.gps.as_deref().map(Path::new);
+    let others = [table, source.cameras.as_deref(), source.run.config.as_deref()];
+    refuse_input(images.chain(others.into_iter().flatten()), &source.output)
 }
 
 /// The scene whose exports are in a folder.
@@ -192,15 +191,18 @@ fn reported_scene(folder: &Path) -> Option<ContentHash> {
     serde_json::from_value(report["scene"].clone()).ok()
 }
 
-fn read_sources(source: &SourceArgs) -> Result<ImageFolder> {
+fn list_sources(source: &SourceArgs) -> Result<Vec<(String, PathBuf)>> {
     if source.panoramas.is_empty() {
         return Err(Hinted::error(
             "no panoramas given",
             "name a folder: setloc build PANORAMAS -o scene.setloc",
         ));
     }
-    let files = list_images(&source.panoramas)?;
-    let folder = ImageFolder::read(&files, &source.camera_book()?, &source.geo(), source.masks.as_deref())?;
+    list_images(&source.panoramas)
+}
+
+fn read_sources(source: &SourceArgs, files: &[(String, PathBuf)]) -> Result<ImageFolder> {
+    let folder = ImageFolder::read(files, &source.camera_book()?, &source.geo(), source.masks.as_deref())?;
     remark(&folder);
     Ok(folder)
 }
@@ -274,7 +276,6 @@ fn component_folder(folder: &Path, at: usize) -> PathBuf {
 }
 
 const POINT_CLOUD: &str = "points.ply";
-const PICTURE: &str = "top_view.png";
 const COLMAP_MODEL: &str = "colmap";
 
 fn write_model(
@@ -371,21 +372,7 @@ pub fn warn_skipped(skipped: &[SkippedImage]) {
 
 #[cfg(test)]
 mod tests {
-    use std::slice;
-
     use super::*;
-
-    #[test]
-    fn exports_among_the_images_are_refused() {
-        let root = tempfile::tempdir().unwrap();
-        let street = root.path().join("street");
-        std::fs::create_dir(&street).unwrap();
-        let refused = refuse_input_folder(slice::from_ref(&street), &root.path().join("street/../street"));
-        let text = format!("{:#}", refused.unwrap_err());
-        assert!(text.contains("street") && text.contains("among the images"), "{text}");
-        refuse_input_folder(slice::from_ref(&street), &street.join("exports")).unwrap();
-        refuse_input_folder(&[street], root.path()).unwrap();
-    }
 
     #[test]
     fn long_lists_of_names_are_cut() {

@@ -12,6 +12,7 @@ use super::args::LocateArgs;
 use super::build::{
     export_folder, listed, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
 };
+use super::outputs::refuse_input;
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use crate::error::Hinted;
 use crate::export::{Marker, localizations_json, ply, renew_colmap, top_view_png};
@@ -42,6 +43,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     let config = args.run.config()?;
     let scene = SceneFile::read(&args.scene)?;
     let files = list_images(&args.photos)?;
+    refuse_inputs(args, &files)?;
     let target = find_target(args.target.as_deref(), &files)?;
     let cameras = args.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default();
     let mut photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
@@ -74,6 +76,14 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
         None => true,
     };
     Ok((what.scene, located, if found && grown { Answer::Done } else { Answer::Negative }))
+}
+
+/// The scene that has grown may replace the scene, but nothing else that is read.
+fn refuse_inputs(args: &LocateArgs, files: &[(String, PathBuf)]) -> Result<()> {
+    let Some(grown) = &args.grow else { return Ok(()) };
+    let photos = files.iter().map(|(_, path)| path.as_path());
+    let others = [args.cameras.as_deref(), args.run.config.as_deref()];
+    refuse_input(photos.chain(others.into_iter().flatten()), grown)
 }
 
 /// Writes the scene that has grown, with its exports; false when there is nothing to grow by.
