@@ -134,3 +134,18 @@ fn outputs_never_replace_what_is_read() {
         assert!(std::fs::read(folder.path().join(output)).unwrap() == before, "{command:?}");
     }
 }
+
+#[test]
+fn results_among_the_photos_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    let run = |arguments: &[&str]| setloc(folder.path(), arguments);
+    assert_eq!(run(&["build", "panoramas", "-o", "s.setloc"]).status.code(), Some(1));
+    for outputs in [&["-o", "panoramas"][..], &["--grow", "panoramas.setloc"]] {
+        let refused = run(&[&["locate", "s.setloc", "panoramas"], outputs].concat());
+        let text = said(&refused);
+        assert_eq!(refused.status.code(), Some(2), "{text}");
+        assert!(text.contains("would go into panoramas, among the images\nhint: "), "{text}");
+        assert_eq!(std::fs::read_dir(folder.path().join("panoramas")).unwrap().count(), 2);
+    }
+}

@@ -12,7 +12,7 @@ use super::args::LocateArgs;
 use super::build::{
     export_folder, listed, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
 };
-use super::outputs::refuse_input;
+use super::outputs::{PICTURE, refuse_image_folder, refuse_input};
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use crate::error::Hinted;
 use crate::export::{Marker, localizations_json, ply, renew_colmap, top_view_png};
@@ -78,9 +78,12 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     Ok((what.scene, located, if found && grown { Answer::Done } else { Answer::Negative }))
 }
 
-/// The scene that has grown may replace the scene, but nothing else that is read.
+/// Results may replace nothing that is read, but for the scene, which may grow in place.
 fn refuse_inputs(args: &LocateArgs, files: &[(String, PathBuf)]) -> Result<()> {
+    refuse_image_folder(&args.photos, &args.output, "name another folder for the results with -o")?;
     let Some(grown) = &args.grow else { return Ok(()) };
+    let hint = "name the scene that has grown otherwise: its exports are in the folder of its name";
+    refuse_image_folder(&args.photos, &export_folder(grown), hint)?;
     let photos = files.iter().map(|(_, path)| path.as_path());
     let others = [args.cameras.as_deref(), args.run.config.as_deref()];
     refuse_input(photos.chain(others.into_iter().flatten()), grown)
@@ -236,7 +239,7 @@ fn write_results(
     if let Some(lack) = renew_colmap(&folder.join("colmap"), &merged, &[])? {
         print::note(&format!("warning: no COLMAP model is written: {lack}"));
     }
-    write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?)?;
+    write_atomically(&folder.join(PICTURE), &top_view_png(model, &markers)?)?;
     let mut report = session.report.to_json();
     report["warnings"] = json!(located.warnings);
     write_json(&folder.join("report.json"), &report)
