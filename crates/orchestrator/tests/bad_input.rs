@@ -4,7 +4,9 @@
 
 mod common;
 
-use common::{gave, panoramas, said, setloc, town};
+use std::fs::OpenOptions;
+
+use common::{gave, panoramas, program, said, setloc, town};
 
 fn picture(shade: u8) -> image::RgbImage {
     image::RgbImage::from_fn(256, 128, |x, y| image::Rgb([(x as u8) ^ (y as u8).wrapping_mul(shade); 3]))
@@ -147,5 +149,32 @@ fn results_among_the_photos_are_refused() {
         assert_eq!(refused.status.code(), Some(2), "{text}");
         assert!(text.contains("would go into panoramas, among the images\nhint: "), "{text}");
         assert_eq!(std::fs::read_dir(folder.path().join("panoramas")).unwrap().count(), 2);
+    }
+}
+
+#[test]
+fn data_that_cannot_be_written_is_an_error_unless_nobody_reads_on() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    assert_eq!(setloc(folder.path(), &["build", "panoramas", "-o", "s.setloc"]).status.code(), Some(1));
+    let commands: [&[&str]; 4] = [
+        &["build", "--print-config"],
+        &["export", "s.setloc", "--format", "json"],
+        &["plan", "panoramas", "-o", "s.setloc", "--format", "json"],
+        &["status"],
+    ];
+    for command in commands {
+        let full = OpenOptions::new().write(true).open("/dev/full").unwrap();
+        let output = program(folder.path(), command).stdout(full).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{command:?}");
+        let text = said(&output);
+        assert!(
+            text.contains("error: cannot write to standard output\n") && text.contains("hint: "),
+            "{text}"
+        );
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let output = program(folder.path(), command).stdout(writer).output().unwrap();
+        assert_eq!(output.status.code(), Some(0), "{command:?}: {}", said(&output));
     }
 }

@@ -33,7 +33,7 @@ const GROWN_COLOR: [u8; 3] = [20, 150, 60];
 pub fn run(args: &BuildArgs) -> Result<Answer> {
     let config = args.source.run.config()?;
     if args.print_config {
-        print::data(config.to_toml()?.trim_end());
+        print::data(config.to_toml()?.trim_end())?;
         return Ok(Answer::Done);
     }
     let output = &args.source.output;
@@ -98,26 +98,26 @@ pub fn plan(args: &PlanArgs) -> Result<Answer> {
     let alike = stored_alike_pairs(args, &folder, &config, (&store, &name))?;
     let graph = next_jobs(args, &folder, &alike, &config, (&store, &name))?;
     if args.format == PlanFormat::Dot {
-        print::data(graph.to_dot().trim_end());
+        print::data(graph.to_dot().trim_end())?;
         return Ok(Answer::Done);
     }
     let planned = graph.plan(&store, &store.run(&name));
     if args.format == PlanFormat::Json {
-        print::data(&serde_json::to_string_pretty(&planned)?);
+        print::data(&serde_json::to_string_pretty(&planned)?)?;
         return Ok(Answer::Done);
     }
     for job in planned.iter().filter(|job| job.prediction == Prediction::Runs) {
-        print::data(&format!("runs     {} {}: {}", job.kind, job.job, job.reasons.join("; ")));
+        print::data(&format!("runs     {} {}: {}", job.kind, job.job, job.reasons.join("; ")))?;
     }
     for job in planned.iter().filter(|job| job.prediction == Prediction::Follows) {
         let (first, more) = (&job.reasons[0], job.reasons.len() - 1);
         let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-        print::data(&format!("follows  {} {}: {first}{more}", job.kind, job.job));
+        print::data(&format!("follows  {} {}: {first}{more}", job.kind, job.job))?;
     }
     let count = |what| planned.iter().filter(|job| job.prediction == what).count();
     let (runs, follows, stored) =
         (count(Prediction::Runs), count(Prediction::Follows), count(Prediction::Stored));
-    print::data(&format!("{runs} jobs run, {follows} depend on them, {stored} are stored"));
+    print::data(&format!("{runs} jobs run, {follows} depend on them, {stored} are stored"))?;
     Ok(Answer::Done)
 }
 

@@ -55,7 +55,7 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
             write_atomically(file, text.as_bytes())?;
             print::note(&format!("wrote {}", file.display()));
         }
-        None => print::data(text.trim_end()),
+        None => print::data(text.trim_end())?,
     }
     Ok(Answer::Done)
 }

@@ -33,7 +33,7 @@ const PHOTO_COLOR: [u8; 3] = [240, 150, 0];
 pub fn run(args: &LocateArgs) -> Result<Answer> {
     let (scene, located, answer) = locate_photos(args)?;
     for (method, photo) in located.answers() {
-        print::data(&line(method, photo, &scene));
+        print::data(&line(method, photo, &scene))?;
     }
     Ok(answer)
 }

@@ -20,7 +20,7 @@ pub fn run(args: &ReportArgs) -> Result<Answer> {
     refuse_input([&args.results, &scene].into_iter().chain(&read).map(PathBuf::as_path), &page)?;
     let digest = Digest::read(&folder)?;
     write_atomically(&page, digest.to_html().as_bytes())?;
-    print::data(digest.to_text().trim_end());
+    print::data(digest.to_text().trim_end())?;
     print::note(&format!("wrote {}", page.display()));
     Ok(Answer::Done)
 }
