@@ -47,6 +47,12 @@ pub fn run(args: &CacheArgs) -> Result<Answer> {
         CacheCommand::Gc { max, min_age } => {
             let removed = store.collect_garbage(max, Duration::from_mins(min_age))?;
             print::data(&format!("removed {} files, {}", removed.files, mebibytes(removed.bytes)))?;
+            if let Some(left) = removed.too_young {
+                print::data(&format!(
+                    "{} are left, more than --max: what is younger than {min_age} minutes stays (--min-age)",
+                    mebibytes(left)
+                ))?;
+            }
         }
         CacheCommand::Verify => {
             let damaged = store.verify()?;
