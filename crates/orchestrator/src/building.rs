@@ -79,7 +79,7 @@ pub fn build_scene(
         Ok(outcome)
     };
     let (run, outcome) = session.run_with(name, &graph, use_results)?;
-    session.remember(name, &before.and(run))?;
+    session.remember(name, &before.and(run));
     outcome
 }
 
