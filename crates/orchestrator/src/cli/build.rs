@@ -53,40 +53,42 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     };
     let seed = args.source.run.seed;
     let outcome = build_scene(&session, &folder, &config, seed, &name, present, write)?;
-    let (run, skipped) = match &outcome {
+    let (scene, run, skipped, is_new) = match outcome {
         BuildOutcome::Unchanged(run, skipped) => {
-            print::note(&format!("{} is up to date: nothing changed", output.display()));
-            (run, skipped)
+            let scene = Arc::new(SceneFile::read(output)?);
+            renew_report(&export, &scene, &skipped, &folder.warnings)?;
+            (scene, run, skipped, false)
         }
         BuildOutcome::Built(built) => {
-            write_report(&export, (&built.scene, built.hash), &built.skipped, &folder.warnings, &session)?;
-            summarize(&built.scene, folder.images.len() + folder.skipped.len());
-            told_by_scene(&folder, &built.scene)
-                .estimated_cameras()
-                .iter()
-                .for_each(|line| print::note(line));
-            if let Some(lack) = built.scene.main().and_then(colmap_lacks) {
-                print::note(&format!("warning: no COLMAP model is written: {lack}"));
-            }
-            if built.scene.components.len() > 1 {
-                print::note(&format!(
-                    "the other components are in {}/component_2 and so on",
-                    export.display()
-                ));
-            }
-            (&built.run, &built.skipped)
+            let Built { scene, hash, skipped, run, .. } = *built;
+            write_report(&export, (&scene, hash), &skipped, &folder.warnings, &session)?;
+            (scene, run, skipped, true)
         }
     };
-    warn_skipped(skipped);
+    tell(&scene, &folder, &export);
+    warn_skipped(&skipped);
     let (wall, cpu) = session.report.totals();
     let (ran, hits) = (run.ran.len(), run.hits);
     print::note(&format!("{ran} jobs ran, {hits} came from the cache; {wall:.1} s, {cpu:.1} CPU s"));
-    print::note(&format!("wrote {} and {}/", output.display(), export.display()));
-    let registered = match &outcome {
-        BuildOutcome::Built(built) => built.scene.main().is_some(),
-        BuildOutcome::Unchanged(..) => SceneFile::read(output)?.main().is_some(),
-    };
-    Ok(if registered { Answer::Done } else { Answer::Negative })
+    let outputs = format!("{} and {}/", output.display(), export.display());
+    print::note(&match (is_new, ran) {
+        (true, _) => format!("wrote {outputs}"),
+        (false, 0) => format!("{} is up to date: nothing changed", output.display()),
+        (false, _) => format!("{outputs} stay as they are: the scene is the same"),
+    });
+    Ok(if scene.main().is_some() { Answer::Done } else { Answer::Negative })
+}
+
+/// Says what the scene is, and what of it is not in all places where it might be sought.
+fn tell(scene: &SceneFile, folder: &ImageFolder, export: &Path) {
+    summarize(scene, folder.images.len() + folder.skipped.len());
+    told_by_scene(folder, scene).estimated_cameras().iter().for_each(|line| print::note(line));
+    if let Some(lack) = scene.main().and_then(colmap_lacks) {
+        print::note(&format!("warning: no COLMAP model is written: {lack}"));
+    }
+    if scene.components.len() > 1 {
+        print::note(&format!("the other components are in {}/component_2 and so on", export.display()));
+    }
 }
 
 /// `setloc plan`
@@ -187,7 +189,7 @@ fn refuse_inputs(source: &SourceArgs, files: &[(String, PathBuf)], export: &Path
 
 /// The scene whose exports are in a folder.
 fn reported_scene(folder: &Path) -> Option<ContentHash> {
-    let report: Value = serde_json::from_slice(&std::fs::read(folder.join("report.json")).ok()?).ok()?;
+    let report: Value = serde_json::from_slice(&std::fs::read(folder.join(REPORT)).ok()?).ok()?;
     serde_json::from_value(report["scene"].clone()).ok()
 }
 
@@ -275,6 +277,7 @@ fn component_folder(folder: &Path, at: usize) -> PathBuf {
     if at == 0 { folder.to_owned() } else { folder.join(format!("component_{}", at + 1)) }
 }
 
+const REPORT: &str = "report.json";
 const POINT_CLOUD: &str = "points.ply";
 const COLMAP_MODEL: &str = "colmap";
 
@@ -315,10 +318,28 @@ pub fn write_report(
 ) -> Result<()> {
     let mut report = session.report.to_json();
     report["scene"] = serde_json::json!(hash);
+    report["notes"] = serde_json::json!(scene.notes);
+    note_odd(&mut report, scene, skipped, warnings);
+    write_json(&folder.join(REPORT), &report)
+}
+
+/// The same of a scene that is there already: what the run cost that made it stays.
+fn renew_report(
+    folder: &Path,
+    scene: &SceneFile,
+    skipped: &[SkippedImage],
+    warnings: &[String],
+) -> Result<()> {
+    let file = folder.join(REPORT);
+    let before: Value = serde_json::from_slice(&std::fs::read(&file)?)?;
+    let mut report = before.clone();
+    note_odd(&mut report, scene, skipped, warnings);
+    if report == before { Ok(()) } else { write_json(&file, &report) }
+}
+
+fn note_odd(report: &mut Value, scene: &SceneFile, skipped: &[SkippedImage], warnings: &[String]) {
     report["skipped"] = serde_json::json!(skipped);
     report["warnings"] = serde_json::json!([warnings, &scene.warnings].concat());
-    report["notes"] = serde_json::json!(scene.notes);
-    write_json(&folder.join("report.json"), &report)
 }
 
 /// Readable JSON.
