@@ -15,7 +15,7 @@ use super::build::{
 use super::outputs::{PICTURE, refuse_image_folder, refuse_input};
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use crate::error::Hinted;
-use crate::export::{Marker, localizations_json, ply, renew_colmap, top_view_png};
+use crate::export::{Marker, localizations_json, origin_json, ply, renew_colmap, top_view_png};
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, Mode, grow, locate};
 use crate::print;
@@ -209,7 +209,7 @@ fn write_results(
         &folder.join("poses.json"),
         &json!({
             "convention": "X_world = R(q) X_camera + center; camera x right, y down, z forward; component: index in the scene's components, 0 the largest",
-            "target": target, "geo_origin": scene.origin, "photos": photos,
+            "target": target, "geo_origin": origin_json(scene), "photos": photos,
             "methods": {
                 "single": localizations_json(&located.single, scene),
                 "camset": of_set(set.map(|set| &set.rigid)), "camset+opt": of_set(set.map(|set| &set.refined)),

@@ -17,7 +17,7 @@ use crate::config::Config;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
-use crate::scene::{Block, SceneFile};
+use crate::scene::{Block, NO_ALTITUDE, SceneFile, has_altitude};
 use crate::stages;
 
 /// The jobs of a scene.
@@ -137,7 +137,12 @@ pub fn add_scene(
     }
     let names: Vec<String> = images.iter().map(|image| image.name.clone()).collect();
     let config = config.scene_toml()?;
-    let params = json!({ "names": names, "origin": origin, "config": config });
+    let altitudes = images.iter().filter(|image| image.position.is_some_and(|place| place.alt_m.is_some()));
+    let has_altitudes = altitudes.count() > 0;
+    let mut params = json!({ "names": names, "origin": origin, "config": config });
+    if origin.is_some() {
+        params["has_altitudes"] = json!(has_altitudes);
+    }
     let scene_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
         let indices = inputs.get::<SceneIndices>("index")?;
@@ -154,6 +159,10 @@ pub fn add_scene(
         let recall = worst_recall(&indices.0);
         let georegistrations = || output.report.georegistrations.iter().map(Option::is_some);
         let origin = origin.filter(|_| georegistrations().next() == Some(true));
+        let origin = origin.map(|at| if has_altitudes { at } else { Wgs84 { alt: NO_ALTITUDE, ..at } });
+        let relative = origin.filter(|origin| !has_altitude(*origin)).map(|_| {
+            "the measured positions have no altitudes: heights are relative, and left out where WGS84 is told".to_owned()
+        });
         Product::new(SceneFile {
             components,
             indices: copy,
@@ -165,6 +174,7 @@ pub fn add_scene(
                 .collect(),
             notes: (output.report.merges.iter().filter_map(MergeRecord::sentence))
                 .chain(recall.as_ref().map(Recall::note))
+                .chain(relative)
                 .collect(),
             config: config.clone(),
             grown: Vec::new(),
