@@ -103,14 +103,14 @@ fn report_and_status_tell_what_came_out() {
 }
 
 #[test]
-fn heights_that_nobody_measured_are_left_out() {
+fn what_measured_positions_do_not_tell_is_said_and_left_out() {
     let folder = tempfile::tempdir().unwrap();
     town(folder.path());
     let truth = std::fs::read_to_string(folder.path().join("town/truth.json")).unwrap();
     let truth: serde_json::Value = serde_json::from_str(&truth).unwrap();
-    let build = |columns: &str, altitude: &str| {
+    let build = |columns: &str, altitude: &str, count: usize| {
         let mut lines = vec![columns.to_owned()];
-        for (image, pose) in truth["images"].as_object().unwrap() {
+        for (image, pose) in truth["images"].as_object().unwrap().iter().take(count) {
             let [east, north] = [0, 1].map(|axis| pose["center"][axis].as_f64().unwrap());
             let (lat, lon) = (47.0 + north / 111_180.0, 8.0 + east / 75_960.0);
             lines.push(format!("{image},{lat},{lon}{altitude}"));
@@ -128,18 +128,26 @@ fn heights_that_nobody_measured_are_left_out() {
         map["features"][0]["geometry"]["coordinates"].as_array().unwrap().len()
     };
 
-    let text = build("name,lat,lon", "");
+    let text = build("name,lat,lon", "", 4);
     assert!(text.contains(note), "{text}");
     let poses = export("json");
     assert!(poses.contains("\"wgs84\": {") && !poses.contains("\"alt\""), "{poses}");
     assert_eq!(coordinates(), 2);
     assert!(!export("kml").contains("ellipsoidal_height_m"));
 
-    let text = build("name,lat,lon,alt", ",0");
+    let text = build("name,lat,lon,alt", ",0", 4);
     assert!(!text.contains(note), "{text}");
     assert!(export("json").contains("\"alt\""));
     assert_eq!(coordinates(), 3);
     assert!(export("kml").contains("ellipsoidal_height_m"));
+
+    let few = "2 measured positions within ";
+    assert!(
+        text.contains("note: positions: 4 of 4 images, median deviation 0.0") && !text.contains(few),
+        "{text}"
+    );
+    let text = build("name,lat,lon", "", 2);
+    assert!(text.contains("note: positions: 2 of 4 images") && text.contains(few), "{text}");
 }
 
 #[test]
