@@ -138,6 +138,20 @@ fn outputs_never_replace_what_is_read() {
 }
 
 #[test]
+fn a_scene_that_would_be_a_folder_is_refused_before_anything_runs() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    std::fs::create_dir(folder.path().join("scenes")).unwrap();
+    for output in ["scenes", "scenes/", "new/"] {
+        let refused = setloc(folder.path(), &["build", "panoramas", "-o", output]);
+        let (text, named) = (said(&refused), output.trim_end_matches('/'));
+        assert_eq!(refused.status.code(), Some(2), "{text}");
+        assert!(text.ends_with(&format!("\nhint: name a file in it: -o {named}/scene.setloc\n")), "{text}");
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
+}
+
+#[test]
 fn results_among_the_photos_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     panoramas(folder.path(), 2);

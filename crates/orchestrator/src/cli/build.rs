@@ -10,7 +10,7 @@ use setloc_sfm::{ImageId, Reconstruction};
 
 use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
-use super::outputs::{PICTURE, refuse_image_folder, refuse_input};
+use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
 use crate::building::{BuildOutcome, Built, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras};
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images};
@@ -37,6 +37,7 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
         return Ok(Answer::Done);
     }
     let output = &args.source.output;
+    refuse_folder("-o", output, "scene.setloc")?;
     let export = args.export.clone().unwrap_or_else(|| export_folder(output));
     let files = list_sources(&args.source)?;
     refuse_inputs(&args.source, &files, &export)?;

@@ -12,7 +12,7 @@ use super::args::LocateArgs;
 use super::build::{
     export_folder, listed, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
 };
-use super::outputs::{PICTURE, refuse_image_folder, refuse_input};
+use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use crate::error::Hinted;
 use crate::export::{Marker, localizations_json, origin_json, ply, renew_colmap, top_view_png};
@@ -82,6 +82,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
 fn refuse_inputs(args: &LocateArgs, files: &[(String, PathBuf)]) -> Result<()> {
     refuse_image_folder(&args.photos, &args.output, "name another folder for the results with -o")?;
     let Some(grown) = &args.grow else { return Ok(()) };
+    refuse_folder("--grow", grown, "grown.setloc")?;
     let hint = "name the scene that has grown otherwise: its exports are in the folder of its name";
     refuse_image_folder(&args.photos, &export_folder(grown), hint)?;
     let photos = files.iter().map(|(_, path)| path.as_path());

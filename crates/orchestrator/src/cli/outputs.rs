@@ -22,6 +22,16 @@ pub fn refuse_input<'p>(inputs: impl IntoIterator<Item = &'p Path>, output: &Pat
     }
 }
 
+/// Refuses a folder where `option` names a file to be written; `example` is a file's name.
+pub fn refuse_folder(option: &str, output: &Path, example: &str) -> Result<()> {
+    let ends_open = output.as_os_str().as_encoded_bytes().ends_with(b"/");
+    if !output.is_dir() && !ends_open && output.file_name().is_some() {
+        return Ok(());
+    }
+    let hint = format!("name a file in it: {option} {}", output.join(example).display());
+    Err(Hinted::error(format!("{} is a folder, and a file is to be written", output.display()), hint))
+}
+
 /// Refuses a folder for results among the images that are given: the next run would read the results as images.
 pub fn refuse_image_folder(images: &[PathBuf], results: &Path, hint: &str) -> Result<()> {
     let is_same = |a: &Path, b: &Path| a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b));
@@ -63,6 +73,17 @@ mod tests {
         std::fs::write(&picture, "").unwrap();
         refuse(slice::from_ref(&photo), &street).unwrap();
         assert!(refuse(&[photo, picture], &street).is_err());
+    }
+
+    #[test]
+    fn a_folder_is_no_file_whether_it_is_there_or_not() {
+        let root = tempfile::tempdir().unwrap();
+        for output in [root.path().to_owned(), root.path().join("new/"), root.path().join("..")] {
+            let error = refuse_folder("-o", &output, "scene.setloc").unwrap_err();
+            let hint = error.downcast_ref::<Hinted>().unwrap().hint();
+            assert_eq!(hint, format!("name a file in it: -o {}", output.join("scene.setloc").display()));
+        }
+        refuse_folder("-o", &root.path().join("new"), "scene.setloc").unwrap();
     }
 
     #[test]
