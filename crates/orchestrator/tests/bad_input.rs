@@ -49,6 +49,9 @@ fn bad_images_among_good_ones_are_skipped_with_a_reason() {
         assert!(text.contains(line), "{line}: {text}");
     }
     assert_eq!(text.matches("skipped panoramas/").count(), 3, "{text}");
+    // What the two equal images share tells nothing of the model.
+    assert!(!text.contains("panoramas/again.jpg–panoramas/pano_000.jpg"), "{text}");
+    assert!(!text.contains("panoramas/pano_000.jpg–panoramas/again.jpg"), "{text}");
     // An image without texture is kept, and told not to be registered.
     let report = gave(&setloc(folder.path(), &["report", "s.setloc"]));
     assert!(report.contains("panoramas/black.jpg\tnot registered\t0 observations"), "{report}");
