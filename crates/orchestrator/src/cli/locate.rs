@@ -5,6 +5,7 @@ use std::sync::Arc;
 use anyhow::Result;
 use serde_json::json;
 use setloc_camset::{PhotoLocalization, Verdict};
+use setloc_features::Calibration;
 use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage};
 
 use super::Answer;
@@ -13,7 +14,7 @@ use super::build::{
     export_folder, listed, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
 };
 use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
-use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
+use crate::dataset::{CameraBook, CameraOrigin, GeoSource, ImageFolder, SourceImage, list_images};
 use crate::error::Hinted;
 use crate::export::{Marker, localizations_json, origin_json, ply, renew_colmap, top_view_png};
 use crate::jobs::LocateJobs;
@@ -57,8 +58,10 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
         Mode::Auto if args.grow.is_some() => Mode::Both,
         mode => mode,
     };
+    let given = photos.images.clone();
     let located = locate(&session, &mut photos, &what, mode, &name, &target)?;
-    photos.estimated_cameras().iter().for_each(|line| print::note(line));
+    let told = ImageFolder { images: with_told_alone(&given, &photos.images, &located), ..photos.clone() };
+    told.estimated_cameras().iter().for_each(|line| print::note(line));
     write_results(&args.output, &located, &what.scene, &target, &session)?;
     warn_skipped(&located.skipped);
     warn_of_scene(&what.scene.warnings);
@@ -76,6 +79,28 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
         None => true,
     };
     Ok((what.scene, located, if found && grown { Answer::Done } else { Answer::Negative }))
+}
+
+/// The photos with the cameras that they told alone, where that is their answer and the set told none; `given` are the
+/// photos before.
+fn with_told_alone(given: &[SourceImage], photos: &[SourceImage], located: &Located) -> Vec<SourceImage> {
+    let answers = located.answers();
+    let told = |given: &SourceImage| {
+        let (method, photo) = answers.iter().find(|(_, photo)| photo.name == given.name)?;
+        let is_told = *method == "single"
+            && photo.verdict != Verdict::NotLocalized
+            && given.calibration == Calibration::Guessed
+            && photo.camera != given.camera;
+        is_told.then(|| photo.camera.clone())
+    };
+    let with_camera = |(given, photo): (&SourceImage, &SourceImage)| {
+        let camera = told(given).filter(|_| photo.camera_origin != CameraOrigin::Estimated);
+        camera.map_or_else(
+            || photo.clone(),
+            |camera| SourceImage { camera, camera_origin: CameraOrigin::Estimated, ..photo.clone() },
+        )
+    };
+    given.iter().zip(photos).map(with_camera).collect()
 }
 
 /// Results may replace nothing that is read, but for the scene, which may grow in place.
@@ -248,7 +273,52 @@ fn write_results(
 
 #[cfg(test)]
 mod tests {
+    use setloc_features::Camera;
+
     use super::*;
+    use crate::fingerprint::ContentHash;
+
+    #[test]
+    fn what_photos_tell_of_their_cameras_alone_is_said_once() {
+        let camera = |focal| Camera::from_focal_guess(40, 30, focal);
+        let image = |name: &str, calibration, camera_origin| SourceImage {
+            name: name.to_owned(),
+            path: PathBuf::new(),
+            hash: ContentHash::of(b""),
+            camera: camera(48.0),
+            calibration,
+            camera_origin,
+            position: None,
+            mask: None,
+        };
+        let photo = |name: &str, verdict, focal| PhotoLocalization {
+            name: name.to_owned(),
+            camera: camera(focal),
+            component: 0,
+            world_from_camera: None,
+            covariance: None,
+            inliers: 0,
+            verdict,
+            reasons: Vec::new(),
+        };
+        let listed = CameraOrigin::Listed;
+        let guess = |name| image(name, Calibration::Guessed, listed);
+        let given = [guess("a"), guess("b"), guess("c"), image("d", Calibration::Known, listed)];
+        let mut photos = given.clone();
+        photos[2].camera_origin = CameraOrigin::Estimated;
+        let single = vec![
+            photo("a", Verdict::Localized, 31.0),
+            photo("b", Verdict::NotLocalized, 32.0),
+            photo("c", Verdict::Localized, 33.0),
+            photo("d", Verdict::Localized, 34.0),
+        ];
+        let located = Located { single, ..Located::default() };
+        let told =
+            ImageFolder { images: with_told_alone(&given, &photos, &located), ..ImageFolder::default() };
+        let line =
+            |focal: &str, photo: &str| format!("focal length estimated with the scene: {focal} px: {photo}");
+        assert_eq!(told.estimated_cameras(), [line("31.0", "a"), line("48.0", "c")]);
+    }
 
     #[test]
     fn a_target_s_name_has_to_fit_one_photo() {
