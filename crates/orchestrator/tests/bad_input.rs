@@ -26,6 +26,26 @@ fn an_empty_folder_is_an_error_with_a_hint() {
 }
 
 #[test]
+fn images_that_are_not_read_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let street = panoramas(folder.path(), 2);
+    std::fs::create_dir(street.join("north")).unwrap();
+    std::fs::copy(street.join("p0.png"), street.join("north/p0.png")).unwrap();
+    std::fs::write(street.join("a.gif"), "").unwrap();
+    std::fs::create_dir(folder.path().join("all")).unwrap();
+    std::fs::rename(&street, folder.path().join("all/panoramas")).unwrap();
+    let plan = |images: &str| setloc(folder.path(), &["plan", images]);
+    let some = said(&plan("all/panoramas"));
+    assert!(some.contains("warning: not read: files of other formats than "), "{some}");
+    assert!(some.contains("(all/panoramas/a.gif), subfolders with images"), "{some}");
+    let none = plan("all");
+    assert_eq!(none.status.code(), Some(2));
+    let named = "given itself (all/panoramas; all/panoramas/north)\n";
+    assert!(said(&none).contains("error: no images in all\nhint: not read: "), "{}", said(&none));
+    assert!(said(&none).ends_with(named), "{}", said(&none));
+}
+
+#[test]
 fn bad_images_among_good_ones_are_skipped_with_a_reason() {
     let folder = tempfile::tempdir().unwrap();
     let panoramas = town(folder.path()).join("panoramas");

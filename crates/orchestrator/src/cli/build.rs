@@ -13,7 +13,7 @@ use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
 use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
 use crate::building::{BuildOutcome, Built, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras};
 use crate::config::Config;
-use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images};
+use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, unread_images};
 use crate::error::Hinted;
 use crate::export::{Marker, colmap_lacks, ply, remove_colmap, renew_colmap, scene_json, top_view_png};
 use crate::fingerprint::ContentHash;
@@ -205,7 +205,9 @@ fn list_sources(source: &SourceArgs) -> Result<Vec<(String, PathBuf)>> {
 }
 
 fn read_sources(source: &SourceArgs, files: &[(String, PathBuf)]) -> Result<ImageFolder> {
-    let folder = ImageFolder::read(files, &source.camera_book()?, &source.geo(), source.masks.as_deref())?;
+    let masks = source.masks.as_deref();
+    let mut folder = ImageFolder::read(files, &source.camera_book()?, &source.geo(), masks)?;
+    folder.warnings.extend(unread_images(&source.panoramas, masks));
     remark(&folder);
     Ok(folder)
 }

@@ -14,7 +14,9 @@ use super::build::{
     export_folder, listed, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
 };
 use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
-use crate::dataset::{CameraBook, CameraOrigin, GeoSource, ImageFolder, SourceImage, list_images};
+use crate::dataset::{
+    CameraBook, CameraOrigin, GeoSource, ImageFolder, SourceImage, list_images, unread_images,
+};
 use crate::error::Hinted;
 use crate::export::{Marker, localizations_json, origin_json, ply, renew_colmap, top_view_png};
 use crate::jobs::LocateJobs;
@@ -48,6 +50,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     let target = find_target(args.target.as_deref(), &files)?;
     let cameras = args.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default();
     let mut photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
+    photos.warnings.extend(unread_images(&args.photos, None));
     remark(&photos);
     // Results of photos are kept beside the scene, where those of its images are.
     let session = args.run.session(&args.scene, Some(&args.output))?;

@@ -151,7 +151,7 @@ fn equal_images(images: &[SourceImage]) -> Option<String> {
 }
 
 /// The first of a list, and how many more there are.
-fn some_of(list: &[String], nouns: &str) -> String {
+pub(super) fn some_of(list: &[String], nouns: &str) -> String {
     let named = list[..list.len().min(NAMED)].join("; ");
     match list.len().saturating_sub(NAMED) {
         0 => named,
