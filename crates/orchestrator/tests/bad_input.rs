@@ -103,6 +103,23 @@ fn options_that_fit_no_image_are_said() {
 }
 
 #[test]
+fn masks_that_leave_nothing_are_said_each_time() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 3);
+    std::fs::create_dir(folder.path().join("masks")).unwrap();
+    image::GrayImage::new(256, 128).save(folder.path().join("masks/p1.png")).unwrap();
+    for _ in 0..2 {
+        let output = setloc(folder.path(), &["build", "panoramas", "--masks", "masks", "-o", "s.setloc"]);
+        let text = said(&output);
+        assert!(text.contains("\nmasks: 1 of 3 images\n"), "{text}");
+        let warning = "warning: masks leave next to nothing of images: panoramas/p1.png (0 keypoints)\n";
+        assert!(text.contains(warning), "{text}");
+        let report = gave(&setloc(folder.path(), &["report", "s.setloc"]));
+        assert!(report.contains(warning), "{report}");
+    }
+}
+
+#[test]
 fn a_folder_without_one_readable_image_is_an_error() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::create_dir(folder.path().join("panoramas")).unwrap();

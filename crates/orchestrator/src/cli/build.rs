@@ -41,7 +41,7 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     let export = args.export.clone().unwrap_or_else(|| export_folder(output));
     let files = list_sources(&args.source)?;
     refuse_inputs(&args.source, &files, &export)?;
-    let folder = read_sources(&args.source, &files)?;
+    let mut folder = read_sources(&args.source, &files)?;
     let session = args.source.run.session(output, Some(&export))?;
     let name = session.store.name_of("build", output);
     let present = std::fs::read(output).ok().map(|bytes| ContentHash::of(&bytes));
@@ -55,13 +55,15 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     let seed = args.source.run.seed;
     let outcome = build_scene(&session, &folder, &config, seed, &name, present, write)?;
     let (scene, run, skipped, is_new) = match outcome {
-        BuildOutcome::Unchanged(run, skipped) => {
+        BuildOutcome::Unchanged(run, skipped, warnings) => {
+            add_warnings(&mut folder, warnings);
             let scene = Arc::new(SceneFile::read(output)?);
             renew_report(&export, &scene, &skipped, &folder.warnings)?;
             (scene, run, skipped, false)
         }
         BuildOutcome::Built(built) => {
-            let Built { scene, hash, skipped, run, .. } = *built;
+            let Built { scene, hash, skipped, warnings, run, .. } = *built;
+            add_warnings(&mut folder, warnings);
             write_report(&export, (&scene, hash), &skipped, &folder.warnings, &session)?;
             (scene, run, skipped, true)
         }
@@ -214,10 +216,20 @@ fn read_sources(source: &SourceArgs, files: &[(String, PathBuf)]) -> Result<Imag
 
 /// Says what the cameras rest on, and what is odd about the images.
 pub fn remark(folder: &ImageFolder) {
-    if let Some(summary) = folder.camera_summary() {
-        print::note(&summary);
+    for summary in [folder.camera_summary(), folder.mask_summary()].iter().flatten() {
+        print::note(summary);
     }
-    for warning in &folder.warnings {
+    warn(&folder.warnings);
+}
+
+/// Says and notes what turned out to be odd about the images.
+fn add_warnings(folder: &mut ImageFolder, warnings: Vec<String>) {
+    warn(&warnings);
+    folder.warnings.extend(warnings);
+}
+
+fn warn(warnings: &[String]) {
+    for warning in warnings {
         print::note(&format!("warning: {warning}"));
     }
 }
@@ -369,9 +381,7 @@ pub fn summarize(scene: &SceneFile, images: usize) {
     for note in &scene.notes {
         print::note(&format!("note: {note}"));
     }
-    for warning in &scene.warnings {
-        print::note(&format!("warning: {warning}"));
-    }
+    warn(&scene.warnings);
 }
 
 /// Most names in a line.

@@ -2,7 +2,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use super::images::ENDINGS;
-use super::remarks::some_of;
+use crate::text::some_of;
 
 /// Endings of image files that cannot be read, lower case.
 const OTHER_ENDINGS: [&str; 20] = [
