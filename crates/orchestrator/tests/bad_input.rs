@@ -158,8 +158,11 @@ fn outputs_never_replace_what_is_read() {
     let run = |arguments: &[&str]| setloc(folder.path(), arguments);
     std::fs::write(folder.path().join("geo.csv"), "p0.png,47,8\n").unwrap();
     assert_eq!(run(&["build", "panoramas", "-o", "s.setloc"]).status.code(), Some(1));
-    let commands: [&[&str]; 7] = [
+    std::fs::create_dir(folder.path().join("masks")).unwrap();
+    image::GrayImage::new(256, 128).save(folder.path().join("masks/p0.png")).unwrap();
+    let commands: [&[&str]; 8] = [
         &["build", "panoramas", "-o", "panoramas/p0.png"],
+        &["build", "panoramas", "--masks", "masks", "-o", "masks/p0.png"],
         &["build", "panoramas", "--gps", "geo.csv", "-o", "geo.csv"],
         &["export", "s.setloc", "--format", "json", "-o", "s.setloc"],
         &["export", "s.setloc", "--format", "top-view", "-o", "panoramas/../s.setloc"],
