@@ -18,6 +18,7 @@ use crate::jobs::{LikelyJobs, SceneJobs, SceneModelJobs, add_first_model, add_sc
 use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::stages::FeatureParams;
+use crate::text::some_of;
 
 /// A scene that was built, or found built.
 pub struct Built {
@@ -29,6 +30,8 @@ pub struct Built {
     pub hash: ContentHash,
     /// Images that are not in it, and why.
     pub skipped: Vec<SkippedImage>,
+    /// What is odd about what was found in the images.
+    pub warnings: Vec<String>,
     /// Features by image name.
     pub features: BTreeMap<String, Arc<ImageFeatures>>,
     /// What ran.
@@ -37,8 +40,8 @@ pub struct Built {
 
 /// What a build came to.
 pub enum BuildOutcome {
-    /// The result is the one with the expected hash: nothing was read.
-    Unchanged(RunResult, Vec<SkippedImage>),
+    /// The result is the one with the expected hash, and not read: what ran, and images and warnings as in [`Built`].
+    Unchanged(RunResult, Vec<SkippedImage>, Vec<String>),
     /// The scene.
     Built(Box<Built>),
 }
@@ -79,7 +82,7 @@ pub fn build_scene(
         Ok(outcome)
     };
     let (run, outcome) = session.run_with(name, &graph, use_results)?;
-    session.remember(name, &before.and(run))?;
+    session.remember(name, &before.and(run));
     outcome
 }
 
@@ -195,8 +198,9 @@ fn outcome_of(
             run.failed.iter().map(|(job, reason)| format!("{job}: {reason}")).collect();
         anyhow::bail!("the scene could not be made: {}", reasons.join("; "));
     };
+    let warnings: Vec<String> = masked_out(executor, folder, jobs)?.into_iter().collect();
     if present == Some(hash) {
-        return Ok(BuildOutcome::Unchanged(run.clone(), skipped));
+        return Ok(BuildOutcome::Unchanged(run.clone(), skipped, warnings));
     }
     let load_features = || {
         let made = folder.images.par_iter().with_max_len(1).zip(&jobs.features);
@@ -207,5 +211,30 @@ fn outcome_of(
         || Ok((executor.load::<SceneFile>(jobs.scene)?, executor.file::<SceneFile>(jobs.scene)?));
     let (scene, features): (Result<_>, Result<BTreeMap<_, _>>) = rayon::join(load_scene, load_features);
     let ((scene, file), features) = (scene?, features?);
-    Ok(BuildOutcome::Built(Box::new(Built { scene, file, hash, skipped, features, run: run.clone() })))
+    Ok(BuildOutcome::Built(Box::new(Built {
+        scene,
+        file,
+        hash,
+        skipped,
+        warnings,
+        features,
+        run: run.clone(),
+    })))
+}
+
+/// Keypoints below which an image can hardly be matched.
+const MIN_KEYPOINTS: usize = 50;
+
+/// Says which masks leave next to nothing of their images.
+fn masked_out(executor: &Executor<'_>, folder: &ImageFolder, jobs: &SceneJobs) -> Result<Option<String>> {
+    let mut images = Vec::new();
+    let masked = folder.images.iter().zip(&jobs.features).filter(|(image, _)| image.mask.is_some());
+    for (image, job) in masked {
+        let found = executor.load_made::<ImageFeatures>(*job)?.map(|features| features.len());
+        if let Some(found) = found.filter(|found| *found < MIN_KEYPOINTS) {
+            images.push(format!("{} ({found} keypoints)", image.name));
+        }
+    }
+    let text = format!("masks leave next to nothing of images: {}", some_of(&images, "images"));
+    Ok(Some(text).filter(|_| !images.is_empty()))
 }

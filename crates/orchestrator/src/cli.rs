@@ -9,6 +9,7 @@ mod demo;
 mod export;
 mod import;
 mod locate;
+mod outputs;
 mod report;
 mod status;
 

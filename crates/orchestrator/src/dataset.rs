@@ -5,11 +5,13 @@ mod geo;
 mod images;
 mod remarks;
 mod truth;
+mod unread;
 
 pub use cameras::CameraBook;
 pub use geo::{GeoBook, GeoSource};
 pub use images::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, with_told_cameras};
 pub use truth::{Truth, TruthPose};
+pub use unread::unread_images;
 
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -6,6 +6,7 @@ mod likely;
 mod locate;
 mod model;
 mod pairs;
+mod positions;
 mod scene;
 
 pub use grow::{LocatedJobs, add_grown};

@@ -132,7 +132,7 @@ pub fn locate(
             }
         }
     }
-    session.remember(name, &whole)?;
+    session.remember(name, &whole);
     Ok(located)
 }
 
@@ -310,7 +310,7 @@ pub fn grow(
     graph.want(grown);
     graph.want_file(grown);
     session.run(name, &graph, |executor, run| {
-        session.remember(name, &before.and(run.clone()))?;
+        session.remember(name, &before.and(run.clone()));
         let Some(hash) = executor.output(grown) else {
             let reasons: Vec<String> =
                 run.failed.iter().map(|(job, reason)| format!("{job}: {reason}")).collect();

@@ -1,11 +1,25 @@
 //! The only place that writes to the terminal: data to standard output, words for people to standard error.
 
-use std::io::Write;
+use std::io::{ErrorKind, Write};
+
+use anyhow::Result;
+
+use crate::error::Hinted;
 
 /// A line of data.
-pub fn data(text: &str) {
-    // A closed pipe, as of `setloc … | head`, is no error of ours.
-    let _ = writeln!(std::io::stdout().lock(), "{text}");
+///
+/// # Errors
+/// When it cannot be written, as where standard output is a file on a full disk. A closed pipe, as of `setloc … | head`, is
+/// none: who reads has enough.
+pub fn data(text: &str) -> Result<()> {
+    let mut output = std::io::stdout().lock();
+    match writeln!(output, "{text}").and_then(|()| output.flush()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => {
+            let error = anyhow::Error::new(error).context("cannot write to standard output");
+            Err(Hinted::wrap(error, "what is printed is incomplete: print it to where there is space"))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// A line for people.

@@ -27,7 +27,7 @@ pub struct SceneFile {
     /// Features of the images, by image id, as artifacts; empty where no component has registered an image. Photos that
     /// share too little with the points are matched with them ([`SceneFile::features_of`]).
     pub features: Vec<Block>,
-    /// WGS84 place of the world's origin, when positions were given.
+    /// WGS84 place of the world's origin, when positions were given; at [`NO_ALTITUDE`] when none of them has one.
     pub origin: Option<Wgs84>,
     /// What the mapper found worth saying.
     pub warnings: Vec<String>,
@@ -44,6 +44,14 @@ pub struct SceneFile {
 }
 
 serde_artifact!(SceneFile, "scene", 10);
+
+/// Altitude of an origin where none was measured: heights are relative. A measured zero is positive.
+pub const NO_ALTITUDE: f64 = -0.0;
+
+/// Whether altitudes were measured, of which this is the scene's origin.
+pub fn has_altitude(origin: Wgs84) -> bool {
+    origin.alt.to_bits() != NO_ALTITUDE.to_bits()
+}
 
 /// Bytes that are stored as one block.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -137,6 +145,17 @@ mod tests {
         assert_eq!([0, 1, 2, 3].map(|component| read.shares_frame(component)), [true, false, true, false]);
         let own = SceneFile { placed: vec![false, false, true], ..scene };
         assert_eq!([0, 1, 2].map(|component| own.shares_frame(component)), [true, false, false]);
+    }
+
+    #[test]
+    fn an_altitude_of_zero_is_one_and_none_is_kept_apart() {
+        let scene =
+            |alt| SceneFile { origin: Some(Wgs84 { lat: 47.0, lon: 8.0, alt }), ..SceneFile::default() };
+        let read = |alt| {
+            let scene: SceneFile = codec::decode(&codec::encode(&scene(alt)).unwrap()).unwrap();
+            has_altitude(scene.origin.unwrap())
+        };
+        assert_eq!([0.0, 400.0, NO_ALTITUDE].map(read), [true, true, false]);
     }
 
     #[test]

@@ -7,7 +7,7 @@ use std::sync::{Arc, OnceLock};
 use anyhow::Result;
 
 use crate::clock;
-use crate::graph::{Broadcast, Executor, JobGraph, Observer, RunOptions, RunResult};
+use crate::graph::{Broadcast, Event, Executor, JobGraph, Observer, RunOptions, RunResult};
 use crate::store::{LastRun, Store};
 use crate::subscribers::{Console, JsonLog, RunReport};
 
@@ -100,18 +100,19 @@ impl Session {
         run
     }
 
-    /// Remembers a run under a name, for `plan`, `explain` and `status`.
-    ///
-    /// # Errors
-    /// When the store cannot be written.
-    pub fn remember(&self, name: &str, run: &RunResult) -> Result<()> {
+    /// Remembers a run under a name, for `plan`, `explain` and `status`; that it cannot is a warning, since its results are
+    /// there.
+    pub fn remember(&self, name: &str, run: &RunResult) {
         let last = LastRun {
             ended_unix_s: clock::unix_secs(),
             ran: run.ran.len(),
             stored: run.keys.len().saturating_sub(run.ran.len()),
             failed: run.failed.clone(),
         };
-        self.store.remember_run(name, run.keys.clone(), last)
+        if let Err(error) = self.store.remember_run(name, run.keys.clone(), last) {
+            let text = format!("`{name}` is not remembered for `plan`, `explain` and `cache gc`: {error:#}");
+            self.observer.notice(&Event::Warning { text });
+        }
     }
 }
 

@@ -268,8 +268,8 @@ impl Store {
 
     /// Removes what the remembered runs do not use, then, oldest first, until at most `max_bytes` are left.
     ///
-    /// What is younger than `min_age` may belong to a run that goes on at this moment, and is left alone unless the
-    /// size demands it.
+    /// What is younger than `min_age` may belong to a run that goes on at this moment, and is left alone, even if it is
+    /// more than that.
     ///
     /// # Errors
     /// When the folders cannot be listed or changed.
@@ -282,17 +282,21 @@ impl Store {
         for run in self.runs()?.into_values() {
             live.extend(run.jobs.into_values().chain(run.unfinished.into_values()));
         }
-        let (mut used, mut kept, mut removed) = (BTreeSet::new(), Vec::new(), Removed::default());
+        let (mut used, mut young_outputs) = (BTreeSet::new(), BTreeSet::new());
+        let (mut kept, mut removed) = (Vec::new(), Removed::default());
         let mut unwanted: BTreeMap<PathBuf, BTreeSet<ContentHash>> = BTreeMap::new();
         for (file, records) in self.records.all()? {
             let Ok(metadata) = fs::metadata(&file) else { continue };
             let young = age(&metadata) < min_age;
             for record in records {
+                if young {
+                    young_outputs.insert(record.output.to_string());
+                }
                 let wanted = young || live.contains(&record.key());
                 match (record.content(), wanted) {
                     (Some(_), true) => {
                         let place = Kept::Record(file.clone(), record.key());
-                        kept.push((metadata.modified()?, record.bytes, place));
+                        kept.push((young, metadata.modified()?, record.bytes, place));
                     }
                     (Some(_), false) => removed.count(record.bytes),
                     (None, true) => drop(used.insert(record.output.to_string())),
@@ -315,17 +319,20 @@ impl Store {
         for path in files_below(&self.root.join("objects"))? {
             let Ok(metadata) = fs::metadata(&path) else { continue };
             let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-            if used.contains(name) || age(&metadata) < min_age {
-                kept.push((metadata.modified()?, metadata.len(), Kept::Object(path)));
+            let young = young_outputs.contains(name) || age(&metadata) < min_age;
+            if young || used.contains(name) {
+                kept.push((young, metadata.modified()?, metadata.len(), Kept::Object(path)));
             } else {
                 remove(&path)?;
                 removed.count(metadata.len());
             }
         }
+        // What is young comes last.
         kept.sort();
-        let mut size: u64 = kept.iter().map(|(_, bytes, _)| bytes).sum();
-        for (_, bytes, place) in kept {
-            if max_bytes.is_none_or(|limit| size <= limit) {
+        let mut size: u64 = kept.iter().map(|(_, _, bytes, _)| bytes).sum();
+        let fits = |size| max_bytes.is_none_or(|limit| size <= limit);
+        for (young, _, bytes, place) in kept {
+            if young || fits(size) {
                 break;
             }
             match place {
@@ -336,6 +343,7 @@ impl Store {
             size -= bytes;
         }
         self.records.remove(&unwanted)?;
+        removed.too_young = (!fits(size)).then_some(size);
         Ok(removed)
     }
 }
@@ -404,6 +412,8 @@ pub struct Removed {
     pub files: usize,
     /// Their size.
     pub bytes: u64,
+    /// Size of what is left, where that is more than the limit and too young to be removed.
+    pub too_young: Option<u64>,
 }
 
 impl Removed {
@@ -593,15 +603,16 @@ mod tests {
         let jobs = BTreeMap::from([("job".to_owned(), fingerprint(1).key())]);
         store.remember_run("scene", jobs, LastRun::default()).unwrap();
         let collect = |max| store.collect_garbage(max, Duration::ZERO).unwrap();
-        assert_eq!(collect(None), Removed { files: 1, bytes: 6 });
+        let removed = |files, bytes| Removed { files, bytes, too_young: None };
+        assert_eq!(collect(None), removed(1, 6));
         assert!(store.lookup(kept).is_some() && store.lookup(lost).is_none());
-        assert_eq!(collect(Some(0)), Removed { files: 1, bytes: 4 });
+        assert_eq!(collect(Some(0)), removed(1, 4));
         assert!(store.lookup(kept).is_none());
         store.write(&fingerprint(1), &LARGE, 0.0).unwrap();
         store.write(&fingerprint(2), &[&LARGE[..], b"unused"].concat(), 0.0).unwrap();
-        assert_eq!(collect(None), Removed { files: 1, bytes: LARGE.len() as u64 + 6 });
+        assert_eq!(collect(None), removed(1, LARGE.len() as u64 + 6));
         assert!(store.lookup(kept).is_some() && store.lookup(lost).is_none());
-        assert_eq!(collect(Some(0)), Removed { files: 1, bytes: LARGE.len() as u64 });
+        assert_eq!(collect(Some(0)), removed(1, LARGE.len() as u64));
     }
 
     #[test]
@@ -612,7 +623,10 @@ mod tests {
         store.note_unfinished("scene", BTreeMap::from([("job".to_owned(), fingerprint(1).key())])).unwrap();
         store.write(&fingerprint(2), b"of a run that goes on", 0.0).unwrap();
         assert_eq!(store.collect_garbage(None, Duration::from_hours(1)).unwrap(), Removed::default());
-        assert_eq!(store.collect_garbage(None, Duration::ZERO).unwrap(), Removed { files: 1, bytes: 21 });
+        let small = store.collect_garbage(Some(30), Duration::from_hours(1)).unwrap();
+        assert_eq!(small, Removed { too_young: Some(37), ..Removed::default() });
+        let unused = Removed { files: 1, bytes: 21, too_young: None };
+        assert_eq!(store.collect_garbage(None, Duration::ZERO).unwrap(), unused);
         assert!(store.lookup(fingerprint(1).key()).is_some());
     }
 

@@ -11,3 +11,15 @@ pub fn add(text: &mut String, piece: Arguments<'_>) {
 pub fn apart(component: usize) -> String {
     format!("in component {}, apart from the largest: its frame is its own", component + 1)
 }
+
+/// So many of a list are named, the others are counted.
+const NAMED: usize = 3;
+
+/// The first of a list, and how many more there are.
+pub fn some_of(list: &[String], nouns: &str) -> String {
+    let named = list[..list.len().min(NAMED)].join("; ");
+    match list.len().saturating_sub(NAMED) {
+        0 => named,
+        more => format!("{named}; {more} more {nouns}"),
+    }
+}

@@ -4,7 +4,9 @@
 
 mod common;
 
-use common::{gave, panoramas, said, setloc, town};
+use std::fs::OpenOptions;
+
+use common::{gave, panoramas, program, said, setloc, town};
 
 fn picture(shade: u8) -> image::RgbImage {
     image::RgbImage::from_fn(256, 128, |x, y| image::Rgb([(x as u8) ^ (y as u8).wrapping_mul(shade); 3]))
@@ -21,6 +23,26 @@ fn an_empty_folder_is_an_error_with_a_hint() {
         "{}",
         said(&output)
     );
+}
+
+#[test]
+fn images_that_are_not_read_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let street = panoramas(folder.path(), 2);
+    std::fs::create_dir(street.join("north")).unwrap();
+    std::fs::copy(street.join("p0.png"), street.join("north/p0.png")).unwrap();
+    std::fs::write(street.join("a.gif"), "").unwrap();
+    std::fs::create_dir(folder.path().join("all")).unwrap();
+    std::fs::rename(&street, folder.path().join("all/panoramas")).unwrap();
+    let plan = |images: &str| setloc(folder.path(), &["plan", images]);
+    let some = said(&plan("all/panoramas"));
+    assert!(some.contains("warning: not read: files of other formats than "), "{some}");
+    assert!(some.contains("(all/panoramas/a.gif), subfolders with images"), "{some}");
+    let none = plan("all");
+    assert_eq!(none.status.code(), Some(2));
+    let named = "given itself (all/panoramas; all/panoramas/north)\n";
+    assert!(said(&none).contains("error: no images in all\nhint: not read: "), "{}", said(&none));
+    assert!(said(&none).ends_with(named), "{}", said(&none));
 }
 
 #[test]
@@ -47,6 +69,9 @@ fn bad_images_among_good_ones_are_skipped_with_a_reason() {
         assert!(text.contains(line), "{line}: {text}");
     }
     assert_eq!(text.matches("skipped panoramas/").count(), 3, "{text}");
+    // What the two equal images share tells nothing of the model.
+    assert!(!text.contains("panoramas/again.jpg–panoramas/pano_000.jpg"), "{text}");
+    assert!(!text.contains("panoramas/pano_000.jpg–panoramas/again.jpg"), "{text}");
     // An image without texture is kept, and told not to be registered.
     let report = gave(&setloc(folder.path(), &["report", "s.setloc"]));
     assert!(report.contains("panoramas/black.jpg\tnot registered\t0 observations"), "{report}");
@@ -75,6 +100,23 @@ fn options_that_fit_no_image_are_said() {
     let nowhere = plan(&["--masks", "mask"]);
     assert_eq!(nowhere.status.code(), Some(2));
     assert!(said(&nowhere).contains("mask is no folder") && said(&nowhere).contains("hint: "));
+}
+
+#[test]
+fn masks_that_leave_nothing_are_said_each_time() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 3);
+    std::fs::create_dir(folder.path().join("masks")).unwrap();
+    image::GrayImage::new(256, 128).save(folder.path().join("masks/p1.png")).unwrap();
+    for _ in 0..2 {
+        let output = setloc(folder.path(), &["build", "panoramas", "--masks", "masks", "-o", "s.setloc"]);
+        let text = said(&output);
+        assert!(text.contains("\nmasks: 1 of 3 images\n"), "{text}");
+        let warning = "warning: masks leave next to nothing of images: panoramas/p1.png (0 keypoints)\n";
+        assert!(text.contains(warning), "{text}");
+        let report = gave(&setloc(folder.path(), &["report", "s.setloc"]));
+        assert!(report.contains(warning), "{report}");
+    }
 }
 
 #[test]
@@ -107,4 +149,89 @@ fn wrong_values_in_cameras_json_are_named_with_their_line() {
     let text = said(&output);
     assert_eq!(output.status.code(), Some(2));
     assert!(text.contains("cameras.json") && text.contains("line 2") && text.contains("`PINHOLE`"), "{text}");
+}
+
+#[test]
+fn outputs_never_replace_what_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    let run = |arguments: &[&str]| setloc(folder.path(), arguments);
+    std::fs::write(folder.path().join("geo.csv"), "p0.png,47,8\n").unwrap();
+    assert_eq!(run(&["build", "panoramas", "-o", "s.setloc"]).status.code(), Some(1));
+    std::fs::create_dir(folder.path().join("masks")).unwrap();
+    image::GrayImage::new(256, 128).save(folder.path().join("masks/p0.png")).unwrap();
+    let commands: [&[&str]; 8] = [
+        &["build", "panoramas", "-o", "panoramas/p0.png"],
+        &["build", "panoramas", "--masks", "masks", "-o", "masks/p0.png"],
+        &["build", "panoramas", "--gps", "geo.csv", "-o", "geo.csv"],
+        &["export", "s.setloc", "--format", "json", "-o", "s.setloc"],
+        &["export", "s.setloc", "--format", "top-view", "-o", "panoramas/../s.setloc"],
+        &["report", "s.setloc", "-o", "s.setloc"],
+        &["report", "s", "-o", "s/poses.json"],
+        &["locate", "s.setloc", "panoramas", "--grow", "panoramas/p1.png"],
+    ];
+    for command in commands {
+        let output = command.last().unwrap();
+        let before = std::fs::read(folder.path().join(output)).unwrap();
+        let refused = run(command);
+        assert_eq!(refused.status.code(), Some(2), "{command:?}");
+        assert!(said(&refused).contains("is read, and would be replaced"), "{}", said(&refused));
+        assert!(std::fs::read(folder.path().join(output)).unwrap() == before, "{command:?}");
+    }
+}
+
+#[test]
+fn a_scene_that_would_be_a_folder_is_refused_before_anything_runs() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    std::fs::create_dir(folder.path().join("scenes")).unwrap();
+    for output in ["scenes", "scenes/", "new/"] {
+        let refused = setloc(folder.path(), &["build", "panoramas", "-o", output]);
+        let (text, named) = (said(&refused), output.trim_end_matches('/'));
+        assert_eq!(refused.status.code(), Some(2), "{text}");
+        assert!(text.ends_with(&format!("\nhint: name a file in it: -o {named}/scene.setloc\n")), "{text}");
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
+}
+
+#[test]
+fn results_among_the_photos_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    let run = |arguments: &[&str]| setloc(folder.path(), arguments);
+    assert_eq!(run(&["build", "panoramas", "-o", "s.setloc"]).status.code(), Some(1));
+    for outputs in [&["-o", "panoramas"][..], &["--grow", "panoramas.setloc"]] {
+        let refused = run(&[&["locate", "s.setloc", "panoramas"], outputs].concat());
+        let text = said(&refused);
+        assert_eq!(refused.status.code(), Some(2), "{text}");
+        assert!(text.contains("would go into panoramas, among the images\nhint: "), "{text}");
+        assert_eq!(std::fs::read_dir(folder.path().join("panoramas")).unwrap().count(), 2);
+    }
+}
+
+#[test]
+fn data_that_cannot_be_written_is_an_error_unless_nobody_reads_on() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    assert_eq!(setloc(folder.path(), &["build", "panoramas", "-o", "s.setloc"]).status.code(), Some(1));
+    let commands: [&[&str]; 4] = [
+        &["build", "--print-config"],
+        &["export", "s.setloc", "--format", "json"],
+        &["plan", "panoramas", "-o", "s.setloc", "--format", "json"],
+        &["status"],
+    ];
+    for command in commands {
+        let full = OpenOptions::new().write(true).open("/dev/full").unwrap();
+        let output = program(folder.path(), command).stdout(full).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{command:?}");
+        let text = said(&output);
+        assert!(
+            text.contains("error: cannot write to standard output\n") && text.contains("hint: "),
+            "{text}"
+        );
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let output = program(folder.path(), command).stdout(writer).output().unwrap();
+        assert_eq!(output.status.code(), Some(0), "{command:?}: {}", said(&output));
+    }
 }

@@ -282,3 +282,28 @@ fn two_builds_at_once_on_one_store_are_both_right() {
         said(&again)
     );
 }
+
+#[test]
+fn a_build_that_finds_its_scene_made_says_the_same_of_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let first = panoramas(folder.path(), 3);
+    std::fs::write(first.join("text.jpg"), "this is no picture").unwrap();
+    let build = |images: &str| {
+        let output = setloc(folder.path(), &["build", images, "-o", "s.setloc"]);
+        assert_eq!(output.status.code(), Some(1), "{}", said(&output));
+        said(&output)
+    };
+    let (made, again) = (build("panoramas"), build("panoramas"));
+    for text in [&made, &again] {
+        assert!(text.contains("scene: 0/4 images could be registered"), "{text}");
+        assert!(text.contains("skipped panoramas/text.jpg: "), "{text}");
+    }
+    assert!(made.contains("wrote s.setloc and s/") && !made.contains("up to date"), "{made}");
+    assert!(again.contains("s.setloc is up to date: nothing changed") && !again.contains("wrote"), "{again}");
+    // Of other images nothing is registered either, but something ran.
+    std::fs::write(first.join("p0.png"), std::fs::read(first.join("p1.png")).unwrap()).unwrap();
+    let other = build("panoramas");
+    assert!(!other.contains("up to date"), "{other}");
+    let report = std::fs::read_to_string(folder.path().join("s/report.json")).unwrap();
+    assert!(report.contains("images of equal content") && report.contains("text.jpg"), "{report}");
+}

@@ -103,6 +103,54 @@ fn report_and_status_tell_what_came_out() {
 }
 
 #[test]
+fn what_measured_positions_do_not_tell_is_said_and_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    town(folder.path());
+    let truth = std::fs::read_to_string(folder.path().join("town/truth.json")).unwrap();
+    let truth: serde_json::Value = serde_json::from_str(&truth).unwrap();
+    let build = |columns: &str, altitude: &str, count: usize| {
+        let mut lines = vec![columns.to_owned()];
+        for (image, pose) in truth["images"].as_object().unwrap().iter().take(count) {
+            let [east, north] = [0, 1].map(|axis| pose["center"][axis].as_f64().unwrap());
+            let (lat, lon) = (47.0 + north / 111_180.0, 8.0 + east / 75_960.0);
+            lines.push(format!("{image},{lat},{lon}{altitude}"));
+        }
+        std::fs::write(folder.path().join("geo.csv"), lines.join("\n")).unwrap();
+        let output =
+            setloc(folder.path(), &["build", "town/panoramas", "--gps", "geo.csv", "-o", "s.setloc"]);
+        assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+        said(&output)
+    };
+    let export = |format: &str| gave(&setloc(folder.path(), &["export", "s.setloc", "--format", format]));
+    let note = "note: the measured positions have no altitudes: heights are relative";
+    let coordinates = || {
+        let map: serde_json::Value = serde_json::from_str(&export("geojson")).unwrap();
+        map["features"][0]["geometry"]["coordinates"].as_array().unwrap().len()
+    };
+
+    let text = build("name,lat,lon", "", 4);
+    assert!(text.contains(note), "{text}");
+    let poses = export("json");
+    assert!(poses.contains("\"wgs84\": {") && !poses.contains("\"alt\""), "{poses}");
+    assert_eq!(coordinates(), 2);
+    assert!(!export("kml").contains("ellipsoidal_height_m"));
+
+    let text = build("name,lat,lon,alt", ",0", 4);
+    assert!(!text.contains(note), "{text}");
+    assert!(export("json").contains("\"alt\""));
+    assert_eq!(coordinates(), 3);
+    assert!(export("kml").contains("ellipsoidal_height_m"));
+
+    let few = "2 measured positions within ";
+    assert!(
+        text.contains("note: positions: 4 of 4 images, median deviation 0.0") && !text.contains(few),
+        "{text}"
+    );
+    let text = build("name,lat,lon", "", 2);
+    assert!(text.contains("note: positions: 2 of 4 images") && text.contains(few), "{text}");
+}
+
+#[test]
 fn a_scene_grows_by_localized_photos_and_says_so() {
     let folder = tempfile::tempdir().unwrap();
     town(folder.path());

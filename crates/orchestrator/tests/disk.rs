@@ -38,6 +38,7 @@ fn a_full_disk_is_named_and_after_making_space_the_build_goes_on() {
     let text = said(&output);
     let (full, after) = text.split_once("SPACE").unwrap();
     assert!(full.contains("error: cannot write store/") && full.contains("No space left"), "{text}");
+    assert!(full.matches("cannot keep the result").count() <= 1, "{text}");
     assert!(full.contains("hint: make space") && full.contains("exit code 2"), "{text}");
     assert!(after.contains("exit code 0"), "{text}");
     // What was written before the disk was full is used.
@@ -49,13 +50,20 @@ fn a_read_only_store_is_named_but_enough_when_nothing_is_to_be_done() {
     let folder = tempfile::tempdir().unwrap();
     town(folder.path());
     let script = "build; mount -o remount,ro store; echo AGAIN >&2; build; rm s.setloc; build
+        echo ELSEWHERE >&2; $SETLOC build town/panoramas -o t.setloc; ls t.setloc t/report.json >&2
         echo CHANGED >&2; rm \"$(ls -d town/panoramas/* | head -n 1)\"; build";
     let Some(output) = with_small_disk(folder.path(), "200m", script) else { return };
     let text = said(&output);
     let (_, rest) = text.split_once("AGAIN").unwrap();
-    let (again, changed) = rest.split_once("CHANGED").unwrap();
+    let (again, rest) = rest.split_once("ELSEWHERE").unwrap();
+    let (elsewhere, changed) = rest.split_once("CHANGED").unwrap();
     assert_eq!(again.matches("0 jobs ran").count(), 2, "{text}");
     assert_eq!(again.matches("exit code 0").count(), 2, "{text}");
+    // All is in the store but how the run is called.
+    let warning = "warning: `build t.setloc` is not remembered for `plan`, `explain` and `cache gc`: cannot write store/";
+    assert!(elsewhere.contains(warning) && elsewhere.contains("t/report.json\n"), "{text}");
+    assert!(elsewhere.matches("error:").count() == 0, "{text}");
+    assert_eq!(changed.matches("warning: cannot keep the result").count(), 1, "{text}");
     assert!(changed.contains("error: cannot write store/") && changed.contains("Read-only"), "{text}");
     assert!(changed.contains("hint: choose a writable folder") && changed.contains("exit code 2"), "{text}");
 }

@@ -362,8 +362,8 @@ pub enum CacheCommand {
     Ls,
     /// Remove what the last runs do not use
     Gc {
-        /// Also remove the oldest results until at most this is left
-        #[arg(long, value_parser = parse_bytes)]
+        /// Also remove the oldest results until at most this is left, as `5GiB`; what is younger than --min-age stays
+        #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
         max: Option<u64>,
         /// Leave what is younger, in minutes: it may belong to a run that goes on
         #[arg(long, value_name = "MINUTES", default_value_t = 60)]
@@ -373,11 +373,12 @@ pub enum CacheCommand {
     Verify,
 }
 
-/// `8GiB`, `500MB`, `1024`.
+/// `8GiB`, `500MB`, `1024B`: a number alone could be meant in any unit.
 pub fn parse_bytes(text: &str) -> Result<u64, String> {
     let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
     let unit = match text[digits.len()..].to_ascii_lowercase().as_str() {
-        "" | "b" => 1,
+        "" => return Err(format!("`{text}` has no unit: write it as 8GiB, 500MB or 1024B")),
+        "b" => 1,
         "k" | "kib" => 1 << 10,
         "kb" => 1000,
         "m" | "mib" => 1 << 20,
@@ -403,6 +404,8 @@ mod tests {
     fn sizes_are_read_with_their_unit() {
         assert_eq!(parse_bytes("8GiB").unwrap(), 8 << 30);
         assert_eq!(parse_bytes("1.5MB").unwrap(), 1_500_000);
-        assert!(parse_bytes("8 apples").is_err() && parse_bytes("-1").is_err());
+        assert_eq!(parse_bytes("1024B").unwrap(), 1024);
+        assert!(parse_bytes("8 apples").is_err() && parse_bytes("-1GiB").is_err());
+        assert!(parse_bytes("5").unwrap_err().contains("`5` has no unit"));
     }
 }

@@ -159,15 +159,16 @@ fn locate_args(set: &SetEntry, scene: &Path, folder: &Path, places: &Places<'_>)
 
 /// Prints and writes the summary; the worst part decides the answer.
 fn finish(args: &BatchArgs, progress: &Progress) -> Result<Answer> {
-    for part in &progress.parts {
+    let line = |part: &Part| {
         let word = match (part.outcome, &part.reason) {
             (Outcome::Done, _) => "done".to_owned(),
             (Outcome::Negative, _) => "negative".to_owned(),
             (Outcome::Skipped, _) => "skipped".to_owned(),
             (Outcome::Failed, reason) => format!("failed: {}", reason.as_deref().unwrap_or_default()),
         };
-        print::data(&format!("{}\t{word}\t{:.1} s", part.name, part.wall_s));
-    }
+        print::data(&format!("{}\t{word}\t{:.1} s", part.name, part.wall_s))
+    };
+    let printed = progress.parts.iter().try_for_each(line);
     let [done, negative, failed, skipped] =
         [Outcome::Done, Outcome::Negative, Outcome::Failed, Outcome::Skipped]
             .map(|outcome| progress.count(outcome));
@@ -178,6 +179,7 @@ fn finish(args: &BatchArgs, progress: &Progress) -> Result<Answer> {
         Some(error) => anyhow::bail!("the batch ended early: {error:#}"),
         None => written.context("cannot write the batch's summary")?,
     }
+    printed?;
     anyhow::ensure!(failed == 0, "{failed} of {} parts failed", progress.total);
     Ok(if negative == 0 { Answer::Done } else { Answer::Negative })
 }

@@ -35,13 +35,13 @@ pub fn run(args: &BenchArgs) -> Result<Answer> {
         let figures = with_cache(&args.run, &output, |run| repeat(args, run, &root, args.gps, &output))?;
         for of_seed in &figures {
             warn_skipped(&of_seed.skipped);
-            print::data(markdown_tables(of_seed).trim_end());
+            print::data(markdown_tables(of_seed).trim_end())?;
         }
         if figures.len() > 1 {
             let metrics = metrics_of(&figures);
             write_json(&output.join("repeats.json"), &metrics)?;
             for (name, value) in &metrics {
-                print::data(&format!("{name}\t{:.4} ± {:.4}", value.mean, value.deviation));
+                print::data(&format!("{name}\t{:.4} ± {:.4}", value.mean, value.deviation))?;
             }
         }
         print::note(&format!("wrote {}/", output.display()));
@@ -90,7 +90,7 @@ fn run_registry(args: &BenchArgs) -> Result<Answer> {
     write_json(&args.output.join("results.json"), &harness.to_json())?;
     write_atomically(&args.output.join("summary.md"), harness.to_markdown().as_bytes())?;
     write_atomically(&args.output.join("report.html"), html_report(&harness).as_bytes())?;
-    print::data(harness.to_markdown().trim_end());
+    print::data(harness.to_markdown().trim_end())?;
     print::note(&format!("wrote {}/", args.output.display()));
     if args.registry.update_baseline {
         baseline.update(&metrics);

@@ -10,9 +10,10 @@ use setloc_sfm::{ImageId, Reconstruction};
 
 use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
+use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
 use crate::building::{BuildOutcome, Built, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras};
 use crate::config::Config;
-use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images};
+use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, unread_images};
 use crate::error::Hinted;
 use crate::export::{Marker, colmap_lacks, ply, remove_colmap, renew_colmap, scene_json, top_view_png};
 use crate::fingerprint::ContentHash;
@@ -32,13 +33,17 @@ const GROWN_COLOR: [u8; 3] = [20, 150, 60];
 pub fn run(args: &BuildArgs) -> Result<Answer> {
     let config = args.source.run.config()?;
     if args.print_config {
-        print::data(config.to_toml()?.trim_end());
+        print::data(config.to_toml()?.trim_end())?;
         return Ok(Answer::Done);
     }
-    let folder = read_sources(&args.source)?;
     let output = &args.source.output;
+    refuse_folder("-o", output, "scene.setloc")?;
     let export = args.export.clone().unwrap_or_else(|| export_folder(output));
-    refuse_input_folder(&args.source.panoramas, &export)?;
+    let files = list_sources(&args.source)?;
+    refuse_inputs(&args.source, &files, &export)?;
+    let mut folder = read_sources(&args.source, &files)?;
+    let masks = folder.images.iter().filter_map(|image| image.mask.as_ref());
+    refuse_input(masks.map(|(path, _)| path.as_path()), output)?;
     let session = args.source.run.session(output, Some(&export))?;
     let name = session.store.name_of("build", output);
     let present = std::fs::read(output).ok().map(|bytes| ContentHash::of(&bytes));
@@ -51,71 +56,75 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     };
     let seed = args.source.run.seed;
     let outcome = build_scene(&session, &folder, &config, seed, &name, present, write)?;
-    let (run, skipped) = match &outcome {
-        BuildOutcome::Unchanged(run, skipped) => {
-            print::note(&format!("{} is up to date: nothing changed", output.display()));
-            (run, skipped)
+    let (scene, run, skipped, is_new) = match outcome {
+        BuildOutcome::Unchanged(run, skipped, warnings) => {
+            add_warnings(&mut folder, warnings);
+            let scene = Arc::new(SceneFile::read(output)?);
+            renew_report(&export, &scene, &skipped, &folder.warnings)?;
+            (scene, run, skipped, false)
         }
         BuildOutcome::Built(built) => {
-            write_report(&export, (&built.scene, built.hash), &built.skipped, &folder.warnings, &session)?;
-            summarize(&built.scene, folder.images.len() + folder.skipped.len());
-            told_by_scene(&folder, &built.scene)
-                .estimated_cameras()
-                .iter()
-                .for_each(|line| print::note(line));
-            if let Some(lack) = built.scene.main().and_then(colmap_lacks) {
-                print::note(&format!("warning: no COLMAP model is written: {lack}"));
-            }
-            if built.scene.components.len() > 1 {
-                print::note(&format!(
-                    "the other components are in {}/component_2 and so on",
-                    export.display()
-                ));
-            }
-            (&built.run, &built.skipped)
+            let Built { scene, hash, skipped, warnings, run, .. } = *built;
+            add_warnings(&mut folder, warnings);
+            write_report(&export, (&scene, hash), &skipped, &folder.warnings, &session)?;
+            (scene, run, skipped, true)
         }
     };
-    warn_skipped(skipped);
+    tell(&scene, &folder, &export);
+    warn_skipped(&skipped);
     let (wall, cpu) = session.report.totals();
     let (ran, hits) = (run.ran.len(), run.hits);
     print::note(&format!("{ran} jobs ran, {hits} came from the cache; {wall:.1} s, {cpu:.1} CPU s"));
-    print::note(&format!("wrote {} and {}/", output.display(), export.display()));
-    let registered = match &outcome {
-        BuildOutcome::Built(built) => built.scene.main().is_some(),
-        BuildOutcome::Unchanged(..) => SceneFile::read(output)?.main().is_some(),
-    };
-    Ok(if registered { Answer::Done } else { Answer::Negative })
+    let outputs = format!("{} and {}/", output.display(), export.display());
+    print::note(&match (is_new, ran) {
+        (true, _) => format!("wrote {outputs}"),
+        (false, 0) => format!("{} is up to date: nothing changed", output.display()),
+        (false, _) => format!("{outputs} stay as they are: the scene is the same"),
+    });
+    Ok(if scene.main().is_some() { Answer::Done } else { Answer::Negative })
+}
+
+/// Says what the scene is, and what of it is not in all places where it might be sought.
+fn tell(scene: &SceneFile, folder: &ImageFolder, export: &Path) {
+    summarize(scene, folder.images.len() + folder.skipped.len());
+    told_by_scene(folder, scene).estimated_cameras().iter().for_each(|line| print::note(line));
+    if let Some(lack) = scene.main().and_then(colmap_lacks) {
+        print::note(&format!("warning: no COLMAP model is written: {lack}"));
+    }
+    if scene.components.len() > 1 {
+        print::note(&format!("the other components are in {}/component_2 and so on", export.display()));
+    }
 }
 
 /// `setloc plan`
 pub fn plan(args: &PlanArgs) -> Result<Answer> {
     let config = args.source.run.config()?;
-    let folder = read_sources(&args.source)?;
+    let folder = read_sources(&args.source, &list_sources(&args.source)?)?;
     let store = Store::at(&cache_folder(args.source.run.cache.as_deref(), &args.source.output));
     let name = store.name_of("build", &args.source.output);
     let alike = stored_alike_pairs(args, &folder, &config, (&store, &name))?;
     let graph = next_jobs(args, &folder, &alike, &config, (&store, &name))?;
     if args.format == PlanFormat::Dot {
-        print::data(graph.to_dot().trim_end());
+        print::data(graph.to_dot().trim_end())?;
         return Ok(Answer::Done);
     }
     let planned = graph.plan(&store, &store.run(&name));
     if args.format == PlanFormat::Json {
-        print::data(&serde_json::to_string_pretty(&planned)?);
+        print::data(&serde_json::to_string_pretty(&planned)?)?;
         return Ok(Answer::Done);
     }
     for job in planned.iter().filter(|job| job.prediction == Prediction::Runs) {
-        print::data(&format!("runs     {} {}: {}", job.kind, job.job, job.reasons.join("; ")));
+        print::data(&format!("runs     {} {}: {}", job.kind, job.job, job.reasons.join("; ")))?;
     }
     for job in planned.iter().filter(|job| job.prediction == Prediction::Follows) {
         let (first, more) = (&job.reasons[0], job.reasons.len() - 1);
         let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-        print::data(&format!("follows  {} {}: {first}{more}", job.kind, job.job));
+        print::data(&format!("follows  {} {}: {first}{more}", job.kind, job.job))?;
     }
     let count = |what| planned.iter().filter(|job| job.prediction == what).count();
     let (runs, follows, stored) =
         (count(Prediction::Runs), count(Prediction::Follows), count(Prediction::Stored));
-    print::data(&format!("{runs} jobs run, {follows} depend on them, {stored} are stored"));
+    print::data(&format!("{runs} jobs run, {follows} depend on them, {stored} are stored"))?;
     Ok(Answer::Done)
 }
 
@@ -173,44 +182,56 @@ fn next_jobs<'g>(
     Ok(graph)
 }
 
-/// What is exported beside images would be read as images by the next build.
-fn refuse_input_folder(inputs: &[PathBuf], export: &Path) -> Result<()> {
-    let Ok(export_at) = export.canonicalize() else { return Ok(()) };
-    let is_export = |input: &&PathBuf| input.canonicalize().is_ok_and(|input| input == export_at);
-    match inputs.iter().find(is_export) {
-        Some(input) => Err(Hinted::error(
-            format!("the exports would go into {}, among the images", input.display()),
-            "name the scene otherwise, or a folder for its exports with --export",
-        )),
-        None => Ok(()),
-    }
+/// Neither the scene nor what is exported may replace what the scene is made from.
+fn refuse_inputs(source: &SourceArgs, files: &[(String, PathBuf)], export: &Path) -> Result<()> {
+    let hint = "name the scene otherwise, or a folder for its exports with --export";
+    refuse_image_folder(&source.panoramas, export, hint)?;
+    let images = files.iter().map(|(_, path)| path.as_path());
+    let table = source.gps.as_deref().map(Path::new);
+    let others = [table, source.cameras.as_deref(), source.run.config.as_deref()];
+    refuse_input(images.chain(others.into_iter().flatten()), &source.output)
 }
 
 /// The scene whose exports are in a folder.
 fn reported_scene(folder: &Path) -> Option<ContentHash> {
-    let report: Value = serde_json::from_slice(&std::fs::read(folder.join("report.json")).ok()?).ok()?;
+    let report: Value = serde_json::from_slice(&std::fs::read(folder.join(REPORT)).ok()?).ok()?;
     serde_json::from_value(report["scene"].clone()).ok()
 }
 
-fn read_sources(source: &SourceArgs) -> Result<ImageFolder> {
+fn list_sources(source: &SourceArgs) -> Result<Vec<(String, PathBuf)>> {
     if source.panoramas.is_empty() {
         return Err(Hinted::error(
             "no panoramas given",
             "name a folder: setloc build PANORAMAS -o scene.setloc",
         ));
     }
-    let files = list_images(&source.panoramas)?;
-    let folder = ImageFolder::read(&files, &source.camera_book()?, &source.geo(), source.masks.as_deref())?;
+    list_images(&source.panoramas)
+}
+
+fn read_sources(source: &SourceArgs, files: &[(String, PathBuf)]) -> Result<ImageFolder> {
+    let masks = source.masks.as_deref();
+    let mut folder = ImageFolder::read(files, &source.camera_book()?, &source.geo(), masks)?;
+    folder.warnings.extend(unread_images(&source.panoramas, masks));
     remark(&folder);
     Ok(folder)
 }
 
 /// Says what the cameras rest on, and what is odd about the images.
 pub fn remark(folder: &ImageFolder) {
-    if let Some(summary) = folder.camera_summary() {
-        print::note(&summary);
+    for summary in [folder.camera_summary(), folder.mask_summary()].iter().flatten() {
+        print::note(summary);
     }
-    for warning in &folder.warnings {
+    warn(&folder.warnings);
+}
+
+/// Says and notes what turned out to be odd about the images.
+fn add_warnings(folder: &mut ImageFolder, warnings: Vec<String>) {
+    warn(&warnings);
+    folder.warnings.extend(warnings);
+}
+
+fn warn(warnings: &[String]) {
+    for warning in warnings {
         print::note(&format!("warning: {warning}"));
     }
 }
@@ -273,8 +294,8 @@ fn component_folder(folder: &Path, at: usize) -> PathBuf {
     if at == 0 { folder.to_owned() } else { folder.join(format!("component_{}", at + 1)) }
 }
 
+const REPORT: &str = "report.json";
 const POINT_CLOUD: &str = "points.ply";
-const PICTURE: &str = "top_view.png";
 const COLMAP_MODEL: &str = "colmap";
 
 fn write_model(
@@ -314,10 +335,28 @@ pub fn write_report(
 ) -> Result<()> {
     let mut report = session.report.to_json();
     report["scene"] = serde_json::json!(hash);
+    report["notes"] = serde_json::json!(scene.notes);
+    note_odd(&mut report, scene, skipped, warnings);
+    write_json(&folder.join(REPORT), &report)
+}
+
+/// The same of a scene that is there already: what the run cost that made it stays.
+fn renew_report(
+    folder: &Path,
+    scene: &SceneFile,
+    skipped: &[SkippedImage],
+    warnings: &[String],
+) -> Result<()> {
+    let file = folder.join(REPORT);
+    let before: Value = serde_json::from_slice(&std::fs::read(&file)?)?;
+    let mut report = before.clone();
+    note_odd(&mut report, scene, skipped, warnings);
+    if report == before { Ok(()) } else { write_json(&file, &report) }
+}
+
+fn note_odd(report: &mut Value, scene: &SceneFile, skipped: &[SkippedImage], warnings: &[String]) {
     report["skipped"] = serde_json::json!(skipped);
     report["warnings"] = serde_json::json!([warnings, &scene.warnings].concat());
-    report["notes"] = serde_json::json!(scene.notes);
-    write_json(&folder.join("report.json"), &report)
 }
 
 /// Readable JSON.
@@ -344,9 +383,7 @@ pub fn summarize(scene: &SceneFile, images: usize) {
     for note in &scene.notes {
         print::note(&format!("note: {note}"));
     }
-    for warning in &scene.warnings {
-        print::note(&format!("warning: {warning}"));
-    }
+    warn(&scene.warnings);
 }
 
 /// Most names in a line.
@@ -371,21 +408,7 @@ pub fn warn_skipped(skipped: &[SkippedImage]) {
 
 #[cfg(test)]
 mod tests {
-    use std::slice;
-
     use super::*;
-
-    #[test]
-    fn exports_among_the_images_are_refused() {
-        let root = tempfile::tempdir().unwrap();
-        let street = root.path().join("street");
-        std::fs::create_dir(&street).unwrap();
-        let refused = refuse_input_folder(slice::from_ref(&street), &root.path().join("street/../street"));
-        let text = format!("{:#}", refused.unwrap_err());
-        assert!(text.contains("street") && text.contains("among the images"), "{text}");
-        refuse_input_folder(slice::from_ref(&street), &street.join("exports")).unwrap();
-        refuse_input_folder(&[street], root.path()).unwrap();
-    }
 
     #[test]
     fn long_lists_of_names_are_cut() {

@@ -28,32 +28,38 @@ pub fn run(args: &CacheArgs) -> Result<Answer> {
         CacheCommand::Ls => {
             let summary = store.summary()?;
             for (kind, (count, bytes)) in &summary.kinds {
-                print::data(&format!("{kind}\t{count}\t{}", mebibytes(*bytes)));
+                print::data(&format!("{kind}\t{count}\t{}", mebibytes(*bytes)))?;
             }
-            print::data(&format!("all objects\t\t{}", mebibytes(summary.bytes)));
+            print::data(&format!("all objects\t\t{}", mebibytes(summary.bytes)))?;
             if summary.orphans > 0 {
                 print::data(&format!(
                     "{} objects belong to no job; `setloc cache gc` removes them",
                     summary.orphans
-                ));
+                ))?;
             }
             if summary.unfinished > 0 {
                 print::data(&format!(
                     "{} files are being written, or were left by a killed run; `setloc cache gc` removes old ones",
                     summary.unfinished
-                ));
+                ))?;
             }
         }
         CacheCommand::Gc { max, min_age } => {
             let removed = store.collect_garbage(max, Duration::from_mins(min_age))?;
-            print::data(&format!("removed {} files, {}", removed.files, mebibytes(removed.bytes)));
+            print::data(&format!("removed {} files, {}", removed.files, mebibytes(removed.bytes)))?;
+            if let Some(left) = removed.too_young {
+                print::data(&format!(
+                    "{} are left, more than --max: what is younger than {min_age} minutes stays (--min-age)",
+                    mebibytes(left)
+                ))?;
+            }
         }
         CacheCommand::Verify => {
             let damaged = store.verify()?;
             for name in &damaged {
-                print::data(&format!("damaged, removed: {name}"));
+                print::data(&format!("damaged, removed: {name}"))?;
             }
-            print::data(&format!("{} damaged objects", damaged.len()));
+            print::data(&format!("{} damaged objects", damaged.len()))?;
             return Ok(if damaged.is_empty() { Answer::Done } else { Answer::Negative });
         }
     }
@@ -80,7 +86,7 @@ pub fn explain(args: &ExplainArgs) -> Result<Answer> {
                 (Some(_), None) => "was not in the run before".to_owned(),
                 (None, _) => "its fingerprint is no longer kept".to_owned(),
             };
-            print::data(&format!("{run}: {label}: {text}"));
+            print::data(&format!("{run}: {label}: {text}"))?;
         }
     }
     if found {

@@ -18,7 +18,7 @@ pub fn run(args: &DemoArgs) -> Result<Answer> {
     let options = BenchOptions { config: run.config()?, seed: run.seed, gps: BenchGps::None };
     let figures = bench_dataset(&session, &town, &options)?;
     write_figures(&args.output, &figures)?;
-    print::data(markdown_tables(&figures).trim_end());
+    print::data(markdown_tables(&figures).trim_end())?;
     let mut good = figures.scene.registered == figures.scene.images;
     for set in &figures.sets {
         let found = |method: &str| set.methods.get(method).is_some_and(|figures| figures.target_registered);

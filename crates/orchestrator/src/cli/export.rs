@@ -4,6 +4,7 @@ use setloc_sfm::Reconstruction;
 use super::Answer;
 use super::args::{ExportArgs, ExportFormat};
 use super::build::scene_markers;
+use super::outputs::refuse_input;
 use crate::error::Hinted;
 use crate::export::{geojson, kml, nerfstudio, ply, scene_json, top_view_png, write_colmap};
 use crate::print;
@@ -12,6 +13,9 @@ use crate::store::write_atomically;
 
 /// `setloc export`
 pub fn run(args: &ExportArgs) -> Result<Answer> {
+    if let Some(output) = &args.output {
+        refuse_input([args.scene.as_path()], output)?;
+    }
     let scene = SceneFile::read(&args.scene)?;
     let component = component(&scene, args.component)?;
     let model = &component.map_or_else(Reconstruction::default, Reconstruction::by_name);
@@ -51,7 +55,7 @@ pub fn run(args: &ExportArgs) -> Result<Answer> {
             write_atomically(file, text.as_bytes())?;
             print::note(&format!("wrote {}", file.display()));
         }
-        None => print::data(text.trim_end()),
+        None => print::data(text.trim_end())?,
     }
     Ok(Answer::Done)
 }

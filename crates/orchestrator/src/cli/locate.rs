@@ -5,6 +5,7 @@ use std::sync::Arc;
 use anyhow::Result;
 use serde_json::json;
 use setloc_camset::{PhotoLocalization, Verdict};
+use setloc_features::Calibration;
 use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage};
 
 use super::Answer;
@@ -12,9 +13,12 @@ use super::args::LocateArgs;
 use super::build::{
     export_folder, listed, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
 };
-use crate::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
+use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
+use crate::dataset::{
+    CameraBook, CameraOrigin, GeoSource, ImageFolder, SourceImage, list_images, unread_images,
+};
 use crate::error::Hinted;
-use crate::export::{Marker, localizations_json, ply, renew_colmap, top_view_png};
+use crate::export::{Marker, localizations_json, origin_json, ply, renew_colmap, top_view_png};
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, Mode, grow, locate};
 use crate::print;
@@ -32,7 +36,7 @@ const PHOTO_COLOR: [u8; 3] = [240, 150, 0];
 pub fn run(args: &LocateArgs) -> Result<Answer> {
     let (scene, located, answer) = locate_photos(args)?;
     for (method, photo) in located.answers() {
-        print::data(&line(method, photo, &scene));
+        print::data(&line(method, photo, &scene))?;
     }
     Ok(answer)
 }
@@ -42,9 +46,11 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     let config = args.run.config()?;
     let scene = SceneFile::read(&args.scene)?;
     let files = list_images(&args.photos)?;
+    refuse_inputs(args, &files)?;
     let target = find_target(args.target.as_deref(), &files)?;
     let cameras = args.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default();
     let mut photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
+    photos.warnings.extend(unread_images(&args.photos, None));
     remark(&photos);
     // Results of photos are kept beside the scene, where those of its images are.
     let session = args.run.session(&args.scene, Some(&args.output))?;
@@ -55,8 +61,10 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
         Mode::Auto if args.grow.is_some() => Mode::Both,
         mode => mode,
     };
+    let given = photos.images.clone();
     let located = locate(&session, &mut photos, &what, mode, &name, &target)?;
-    photos.estimated_cameras().iter().for_each(|line| print::note(line));
+    let told = ImageFolder { images: with_told_alone(&given, &photos.images, &located), ..photos.clone() };
+    told.estimated_cameras().iter().for_each(|line| print::note(line));
     write_results(&args.output, &located, &what.scene, &target, &session)?;
     warn_skipped(&located.skipped);
     warn_of_scene(&what.scene.warnings);
@@ -74,6 +82,40 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
         None => true,
     };
     Ok((what.scene, located, if found && grown { Answer::Done } else { Answer::Negative }))
+}
+
+/// The photos with the cameras that they told alone, where that is their answer and the set told none; `given` are the
+/// photos before.
+fn with_told_alone(given: &[SourceImage], photos: &[SourceImage], located: &Located) -> Vec<SourceImage> {
+    let answers = located.answers();
+    let told = |given: &SourceImage| {
+        let (method, photo) = answers.iter().find(|(_, photo)| photo.name == given.name)?;
+        let is_told = *method == "single"
+            && photo.verdict != Verdict::NotLocalized
+            && given.calibration == Calibration::Guessed
+            && photo.camera != given.camera;
+        is_told.then(|| photo.camera.clone())
+    };
+    let with_camera = |(given, photo): (&SourceImage, &SourceImage)| {
+        let camera = told(given).filter(|_| photo.camera_origin != CameraOrigin::Estimated);
+        camera.map_or_else(
+            || photo.clone(),
+            |camera| SourceImage { camera, camera_origin: CameraOrigin::Estimated, ..photo.clone() },
+        )
+    };
+    given.iter().zip(photos).map(with_camera).collect()
+}
+
+/// Results may replace nothing that is read, but for the scene, which may grow in place.
+fn refuse_inputs(args: &LocateArgs, files: &[(String, PathBuf)]) -> Result<()> {
+    refuse_image_folder(&args.photos, &args.output, "name another folder for the results with -o")?;
+    let Some(grown) = &args.grow else { return Ok(()) };
+    refuse_folder("--grow", grown, "grown.setloc")?;
+    let hint = "name the scene that has grown otherwise: its exports are in the folder of its name";
+    refuse_image_folder(&args.photos, &export_folder(grown), hint)?;
+    let photos = files.iter().map(|(_, path)| path.as_path());
+    let others = [args.cameras.as_deref(), args.run.config.as_deref()];
+    refuse_input(photos.chain(others.into_iter().flatten()), grown)
 }
 
 /// Writes the scene that has grown, with its exports; false when there is nothing to grow by.
@@ -196,7 +238,7 @@ fn write_results(
         &folder.join("poses.json"),
         &json!({
             "convention": "X_world = R(q) X_camera + center; camera x right, y down, z forward; component: index in the scene's components, 0 the largest",
-            "target": target, "geo_origin": scene.origin, "photos": photos,
+            "target": target, "geo_origin": origin_json(scene), "photos": photos,
             "methods": {
                 "single": localizations_json(&located.single, scene),
                 "camset": of_set(set.map(|set| &set.rigid)), "camset+opt": of_set(set.map(|set| &set.refined)),
@@ -226,7 +268,7 @@ fn write_results(
     if let Some(lack) = renew_colmap(&folder.join("colmap"), &merged, &[])? {
         print::note(&format!("warning: no COLMAP model is written: {lack}"));
     }
-    write_atomically(&folder.join("top_view.png"), &top_view_png(model, &markers)?)?;
+    write_atomically(&folder.join(PICTURE), &top_view_png(model, &markers)?)?;
     let mut report = session.report.to_json();
     report["warnings"] = json!(located.warnings);
     write_json(&folder.join("report.json"), &report)
@@ -234,7 +276,52 @@ fn write_results(
 
 #[cfg(test)]
 mod tests {
+    use setloc_features::Camera;
+
     use super::*;
+    use crate::fingerprint::ContentHash;
+
+    #[test]
+    fn what_photos_tell_of_their_cameras_alone_is_said_once() {
+        let camera = |focal| Camera::from_focal_guess(40, 30, focal);
+        let image = |name: &str, calibration, camera_origin| SourceImage {
+            name: name.to_owned(),
+            path: PathBuf::new(),
+            hash: ContentHash::of(b""),
+            camera: camera(48.0),
+            calibration,
+            camera_origin,
+            position: None,
+            mask: None,
+        };
+        let photo = |name: &str, verdict, focal| PhotoLocalization {
+            name: name.to_owned(),
+            camera: camera(focal),
+            component: 0,
+            world_from_camera: None,
+            covariance: None,
+            inliers: 0,
+            verdict,
+            reasons: Vec::new(),
+        };
+        let listed = CameraOrigin::Listed;
+        let guess = |name| image(name, Calibration::Guessed, listed);
+        let given = [guess("a"), guess("b"), guess("c"), image("d", Calibration::Known, listed)];
+        let mut photos = given.clone();
+        photos[2].camera_origin = CameraOrigin::Estimated;
+        let single = vec![
+            photo("a", Verdict::Localized, 31.0),
+            photo("b", Verdict::NotLocalized, 32.0),
+            photo("c", Verdict::Localized, 33.0),
+            photo("d", Verdict::Localized, 34.0),
+        ];
+        let located = Located { single, ..Located::default() };
+        let told =
+            ImageFolder { images: with_told_alone(&given, &photos, &located), ..ImageFolder::default() };
+        let line =
+            |focal: &str, photo: &str| format!("focal length estimated with the scene: {focal} px: {photo}");
+        assert_eq!(told.estimated_cameras(), [line("31.0", "a"), line("48.0", "c")]);
+    }
 
     #[test]
     fn a_target_s_name_has_to_fit_one_photo() {

@@ -1,8 +1,11 @@
+use std::path::PathBuf;
+
 use anyhow::Result;
 
 use super::Answer;
 use super::args::ReportArgs;
 use super::build::export_folder;
+use super::outputs::{refuse_folder, refuse_input};
 use crate::digest::Digest;
 use crate::print;
 use crate::store::write_atomically;
@@ -11,10 +14,14 @@ use crate::store::write_atomically;
 pub fn run(args: &ReportArgs) -> Result<Answer> {
     // Of a scene file: what `build` wrote beside it.
     let folder = if args.results.is_file() { export_folder(&args.results) } else { args.results.clone() };
-    let digest = Digest::read(&folder)?;
     let page = args.output.clone().unwrap_or_else(|| folder.join("report.html"));
+    refuse_folder("-o", &page, "report.html")?;
+    let read = ["poses.json", "report.json", "top_view.png"].map(|name| folder.join(name));
+    let scene = folder.with_extension("setloc");
+    refuse_input([&args.results, &scene].into_iter().chain(&read).map(PathBuf::as_path), &page)?;
+    let digest = Digest::read(&folder)?;
     write_atomically(&page, digest.to_html().as_bytes())?;
-    print::data(digest.to_text().trim_end());
+    print::data(digest.to_text().trim_end())?;
     print::note(&format!("wrote {}", page.display()));
     Ok(Answer::Done)
 }

@@ -12,16 +12,16 @@ pub fn run(args: &StatusArgs) -> Result<Answer> {
     let store = existing(&args.cache)?;
     let summary = store.summary()?;
     let results: usize = summary.kinds.values().map(|(count, _)| count).sum();
-    print::data(&format!("{results} results, {} in {}", mebibytes(summary.bytes), store.root().display()));
+    print::data(&format!("{results} results, {} in {}", mebibytes(summary.bytes), store.root().display()))?;
     for (kind, (count, bytes)) in &summary.kinds {
-        print::data(&format!("  {kind}\t{count}\t{}", mebibytes(*bytes)));
+        print::data(&format!("  {kind}\t{count}\t{}", mebibytes(*bytes)))?;
     }
     let mut runs: Vec<RunRecord> = store.runs()?.into_values().collect();
     let ended = |run: &RunRecord| run.last.as_ref().map_or(0, |last| last.ended_unix_s);
     runs.sort_by(|a, b| ended(b).cmp(&ended(a)).then_with(|| a.name.cmp(&b.name)));
     for run in &runs {
         for line in describe(&store, run) {
-            print::data(&line);
+            print::data(&line)?;
         }
     }
     Ok(Answer::Done)

@@ -6,13 +6,13 @@ use rayon::prelude::*;
 use setloc_features::{Calibration, Camera, CameraSource, GeoPosition};
 
 use super::remarks::{Given, warnings_of};
-use super::{CameraBook, GeoBook, GeoSource};
+use super::{CameraBook, GeoBook, GeoSource, unread_images};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
 use crate::stages;
 
 /// Endings of files that are taken as images, lower case.
-const ENDINGS: [&str; 8] = ["jpg", "jpeg", "png", "tif", "tiff", "webp", "bmp", "jpe"];
+pub(super) const ENDINGS: [&str; 8] = ["jpg", "jpeg", "png", "tif", "tiff", "webp", "bmp", "jpe"];
 
 /// An image to work on.
 #[derive(Debug, Clone)]
@@ -122,7 +122,8 @@ pub fn list_images(paths: &[PathBuf]) -> Result<Vec<(String, PathBuf)>> {
     files.retain(|path| seen.insert(real_path(path)));
     if files.is_empty() {
         let shown: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
-        let hint = format!("give a folder with images ({}) or image files", ENDINGS.join(", "));
+        let give = || format!("give a folder with images ({}) or image files", ENDINGS.join(", "));
+        let hint = unread_images(paths, None).unwrap_or_else(give);
         return Err(Hinted::error(format!("no images in {}", shown.join(", ")), hint));
     }
     let mut named: Vec<(String, PathBuf)> = names_of(&files).into_iter().zip(files).collect();

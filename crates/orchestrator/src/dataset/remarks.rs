@@ -5,9 +5,9 @@ use setloc_features::{Camera, CameraSource};
 
 use super::{CameraBook, CameraOrigin, GeoBook, GeoSource, ImageFolder, SourceImage};
 use crate::fingerprint::ContentHash;
+use crate::stages;
+use crate::text::some_of;
 
-/// So many of a kind are named in a warning, the others are counted.
-const NAMED: usize = 3;
 const FALLBACK: CameraOrigin = CameraOrigin::Guessed(CameraSource::Fallback);
 
 impl ImageFolder {
@@ -22,6 +22,12 @@ impl ImageFolder {
         }
         let parts: Vec<String> = counts.into_iter().map(|(origin, count)| in_words(origin, count)).collect();
         (!parts.is_empty()).then(|| format!("cameras: {}", parts.join(", ")))
+    }
+
+    /// How many images have masks, where some have.
+    pub fn mask_summary(&self) -> Option<String> {
+        let masked = self.images.iter().filter(|image| image.mask.is_some()).count();
+        (masked > 0).then(|| format!("masks: {masked} of {} images", self.images.len()))
     }
 
     /// What the set has told of cameras that were a guess, a line each.
@@ -76,6 +82,7 @@ pub(super) fn warnings_of(images: &[SourceImage], given: &Given<'_>) -> Vec<Stri
         guessed_cameras(images),
         positions_without_image(images, given.geo, given.table),
         masks_without_image(images, given.masks),
+        masks_of_another_shape(images),
         equal_images(images),
     ];
     warnings.into_iter().flatten().collect()
@@ -138,6 +145,24 @@ fn masks_without_image(images: &[SourceImage], masks: Option<&Path>) -> Option<S
     })
 }
 
+/// By how much the ratio of a mask's sides may differ from that of its image, for rounding.
+const SAME_SHAPE: f64 = 0.01;
+
+fn masks_of_another_shape(images: &[SourceImage]) -> Option<String> {
+    let of_another_shape = |image: &SourceImage| {
+        let bytes = std::fs::read(&image.mask.as_ref()?.0).ok()?;
+        let mask = stages::probe(&bytes, &stages::DecodeLimits::default()).ok()?;
+        let ratio = |width: u32, height: u32| f64::from(width) / f64::from(height);
+        let (width, height) = (image.camera.width, image.camera.height);
+        let differs = (ratio(mask.width, mask.height) / ratio(width, height) - 1.0).abs() > SAME_SHAPE;
+        differs
+            .then(|| format!("{} is {width}×{height}, its mask {}×{}", image.name, mask.width, mask.height))
+    };
+    let stretched: Vec<String> = images.iter().filter_map(of_another_shape).collect();
+    let message = "masks of another aspect ratio are stretched to their images";
+    (!stretched.is_empty()).then(|| format!("{message}: {}", some_of(&stretched, "images")))
+}
+
 fn equal_images(images: &[SourceImage]) -> Option<String> {
     let mut first_of: BTreeMap<ContentHash, &str> = BTreeMap::new();
     let mut pairs = Vec::new();
@@ -148,15 +173,6 @@ fn equal_images(images: &[SourceImage]) -> Option<String> {
         }
     }
     (!pairs.is_empty()).then(|| format!("images of equal content: {}", some_of(&pairs, "pairs")))
-}
-
-/// The first of a list, and how many more there are.
-fn some_of(list: &[String], nouns: &str) -> String {
-    let named = list[..list.len().min(NAMED)].join("; ");
-    match list.len().saturating_sub(NAMED) {
-        0 => named,
-        more => format!("{named}; {more} more {nouns}"),
-    }
 }
 
 #[cfg(test)]
@@ -255,6 +271,25 @@ mod tests {
         assert!(lost[0].ends_with("that of p/a.png is a.png.png or a.png"), "{lost:?}");
         image::GrayImage::new(64, 32).save(masks.join("a.png")).unwrap();
         assert!(folder.read(&none, &GeoSource::None, Some(&masks)).warnings.is_empty());
+    }
+
+    #[test]
+    fn it_is_said_how_many_masks_there_are_and_which_have_another_shape() {
+        let folder =
+            Folder::of(&[("a.png", 64, 32), ("b.png", 64, 32), ("c.png", 64, 32), ("d.png", 333, 100)]);
+        let masks = folder.0.path().join("masks");
+        std::fs::create_dir(&masks).unwrap();
+        for (name, width, height) in [("a.png", 32, 16), ("b.png", 32, 32), ("d.png", 33, 10)] {
+            image::GrayImage::new(width, height).save(masks.join(name)).unwrap();
+        }
+        let read = folder.read(&CameraBook::default(), &GeoSource::None, Some(&masks));
+        assert_eq!(read.mask_summary().unwrap(), "masks: 3 of 4 images");
+        let of_masks: Vec<&String> =
+            read.warnings.iter().filter(|warning| warning.contains("mask")).collect();
+        let stretched =
+            "masks of another aspect ratio are stretched to their images: p/b.png is 64×32, its mask 32×32";
+        assert_eq!(of_masks, [stretched]);
+        assert_eq!(folder.read_alone().mask_summary(), None);
     }
 
     #[test]

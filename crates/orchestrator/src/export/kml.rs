@@ -9,7 +9,7 @@ use crate::text::add;
 /// Camera positions as KML placemarks, with the heading of the optical axis in degrees from north.
 ///
 /// KML counts altitudes from the sea's level, a scene from the ellipsoid, tens of metres off. So placemarks are clamped to
-/// the ground, and the altitude is told as data.
+/// the ground, and the altitude is told as data where it was measured.
 ///
 /// # Errors
 /// When the scene has no WGS84 origin.
@@ -17,10 +17,10 @@ pub fn kml(poses: &[(String, Rigid)], origin: Option<Wgs84>) -> Result<String> {
     let mut text = String::from(
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<kml xmlns=\"http://www.opengis.net/kml/2.2\">\n<Document>\n",
     );
-    for Standpoint { name, place, heading_deg } in standpoints(poses, origin, "KML")? {
-        let Wgs84 { lat, lon, alt } = place;
+    for Standpoint { name, lat, lon, alt, heading_deg } in standpoints(poses, origin, "KML")? {
         add(&mut text, format_args!("<Placemark>\n<name>{}</name>\n<ExtendedData>\n", escape(name)));
-        for (key, value) in [("heading_deg", heading_deg), ("ellipsoidal_height_m", alt)] {
+        for (key, value) in [("heading_deg", Some(heading_deg)), ("ellipsoidal_height_m", alt)] {
+            let Some(value) = value else { continue };
             add(&mut text, format_args!("<Data name=\"{key}\"><value>{value}</value></Data>\n"));
         }
         let point = "<altitudeMode>clampToGround</altitudeMode>";
@@ -50,6 +50,9 @@ mod tests {
         let (lon, lat) = value("<coordinates>", "<").split_once(',').unwrap();
         let (lon, lat): (f64, f64) = (lon.parse().unwrap(), lat.parse().unwrap());
         assert!((lon - 8.0).abs() < 1e-9 && (lat - 47.000_998).abs() < 1e-5, "{lon} {lat}");
+        assert!(text.contains("ellipsoidal_height_m"), "{text}");
+        let relative = Wgs84 { alt: crate::scene::NO_ALTITUDE, ..origin };
+        assert!(!kml(&poses, Some(relative)).unwrap().contains("ellipsoidal_height_m"));
         let error = format!("{:#}", kml(&poses, None).unwrap_err());
         assert_eq!(error, "cannot write KML: the scene has no geographic origin");
     }

@@ -3,12 +3,18 @@ use setloc_camset::PhotoLocalization;
 use setloc_features::Wgs84;
 use setloc_sfm::{ImageId, Rigid};
 
+use super::geographic::place_json;
 use crate::scene::SceneFile;
 
 /// `world_from_camera` as quaternion (w, x, y, z) and centre.
 pub fn pose_json(pose: &Rigid) -> Value {
     let (q, c) = (pose.rotation.quaternion(), pose.translation);
     json!({ "q_wxyz": [q.w, q.i, q.j, q.k], "center": [c.x, c.y, c.z] })
+}
+
+/// Where the scene's origin is on the map.
+pub fn origin_json(scene: &SceneFile) -> Value {
+    json!(scene.origin.map(|origin| place_json(origin, origin)))
 }
 
 /// All cameras and poses of a scene; `grown` are images that it has grown by.
@@ -29,7 +35,7 @@ pub fn scene_json(scene: &SceneFile) -> Value {
                     let place = pose
                         .zip(scene.origin)
                         .filter(|_| scene.is_placed(component))
-                        .map(|(pose, origin)| Wgs84::from_enu(&pose.translation, origin));
+                        .map(|(pose, origin)| place_json(Wgs84::from_enu(&pose.translation, origin), origin));
                     json!({
                         "name": image.name, "world_from_camera": pose.map(pose_json), "wgs84": place,
                         "camera": model.camera_of(id), "observations": observations[id.index()],
@@ -45,7 +51,7 @@ pub fn scene_json(scene: &SceneFile) -> Value {
         .collect();
     json!({
         "convention": "X_world = R(q) X_camera + center; camera x right, y down, z forward; pixel (0.5, 0.5) is the first pixel's centre",
-        "geo_origin": scene.origin, "components": components, "warnings": scene.warnings,
+        "geo_origin": origin_json(scene), "components": components, "warnings": scene.warnings,
         "notes": scene.notes,
     })
 }
@@ -63,7 +69,9 @@ pub fn localizations_json(photos: &[PhotoLocalization], scene: &SceneFile) -> Va
     let one = |photo: &PhotoLocalization| {
         let pose = photo.world_from_camera.as_ref();
         let origin = scene.origin.filter(|_| scene.is_placed(photo.component));
-        let place = pose.zip(origin).map(|(pose, origin)| Wgs84::from_enu(&pose.translation, origin));
+        let place = pose
+            .zip(origin)
+            .map(|(pose, origin)| place_json(Wgs84::from_enu(&pose.translation, origin), origin));
         let covariance = photo
             .covariance
             .map(|c| c.row_iter().map(|row| row.iter().copied().collect::<Vec<f64>>()).collect::<Vec<_>>());

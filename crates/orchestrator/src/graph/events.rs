@@ -52,6 +52,15 @@ pub enum Event {
         /// Why.
         reason: String,
     },
+    /// A job's result cannot be kept; the run ends with the reason, and a warning tells all of them at once.
+    Unkept {
+        /// Its kind.
+        kind: &'static str,
+        /// Its name.
+        job: String,
+        /// Why.
+        reason: String,
+    },
     /// A job was left out since an input of it failed.
     Skipped {
         /// Its kind.

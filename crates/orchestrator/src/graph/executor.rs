@@ -99,6 +99,8 @@ struct Shared {
     ready: BTreeSet<JobId>,
     in_flight: usize,
     memory_in_flight: u64,
+    /// Jobs whose results cannot be kept.
+    unkept: Vec<JobId>,
     fatal: Option<anyhow::Error>,
 }
 
@@ -157,7 +159,8 @@ impl<'a> Executor<'a> {
             .collect();
         let ready =
             graph.graph.node_indices().filter(|id| slots[id.index()].dependencies_left == 0).collect();
-        let shared = Shared { slots, ready, in_flight: 0, memory_in_flight: 0, fatal: None };
+        let shared =
+            Shared { slots, ready, in_flight: 0, memory_in_flight: 0, unkept: Vec::new(), fatal: None };
         Self {
             graph,
             options,
@@ -200,6 +203,7 @@ impl<'a> Executor<'a> {
             let ended_early = self.lock().fatal.is_some() || self.options.stop.load(Ordering::Relaxed);
             (!ended_early).then(|| meanwhile(&self.result()))
         });
+        self.tell_unkept();
         self.options.observer.notice(&Event::Ended);
         if let Some(error) = self.lock().fatal.take() {
             return Err(error);
@@ -329,14 +333,28 @@ impl<'a> Executor<'a> {
             // Of what came together, some may still find room.
             for made in &together {
                 let Err(error) = self.keep_together(std::slice::from_ref(made)) else { continue };
-                let reason = format!("cannot keep the result of {}", self.graph.job(made.id).label());
-                let state = self.failed(made.id, &anyhow::anyhow!("{error:#}").context(reason));
+                let (job, reason) = (self.graph.job(made.id), format!("{error:#}"));
+                let event = Event::Unkept { kind: job.kind, job: job.name.clone(), reason: reason.clone() };
+                self.options.observer.notice(&event);
                 let mut shared = self.lock();
+                shared.unkept.push(made.id);
                 let slot = &mut shared.slots[made.id.index()];
-                (slot.state, slot.output) = (state, None);
+                (slot.state, slot.output) = (State::Failed(reason), None);
                 shared.fatal.get_or_insert(error);
             }
         }
+    }
+
+    /// Says which results are not kept, in one line: one reason meets them all.
+    fn tell_unkept(&self) {
+        let mut unkept = std::mem::take(&mut self.lock().unkept);
+        unkept.sort();
+        let Some(first) = unkept.first().map(|id| self.graph.job(*id).label()) else { return };
+        let text = match unkept.len() {
+            1 => format!("cannot keep the result of {first}"),
+            count => format!("cannot keep the results of {count} jobs: {first}, …"),
+        };
+        self.options.observer.notice(&Event::Warning { text });
     }
 
     fn keep_together(&self, made: &[Unkept]) -> Result<()> {

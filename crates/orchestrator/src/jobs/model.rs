@@ -335,6 +335,10 @@ fn run_model(
     if params.continue_planes {
         output.open_pairs = output.open_among(&pairs);
     }
+    // What two copies of an image share tells nothing of where they stand, and few of its matches become points.
+    let contents: Vec<ContentHash> =
+        features.iter().map(|(at, _)| inputs.hash(&features_role(*at))).collect::<Result<_>>()?;
+    pairs.retain(|pair| contents[pair.first.index()] != contents[pair.second.index()]);
     for (at, component) in output.components.iter_mut().enumerate() {
         let report = assess(quality, component, &pairs);
         output.report.warnings.extend(report.sentences(component));

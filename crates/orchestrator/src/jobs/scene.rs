@@ -11,13 +11,14 @@ use super::choose_pairs;
 use super::model::{
     ModelJobs, ModelKind, ModelSource, add_model, features_role, image_of_place_holder, with_names,
 };
+use super::positions::{self, Fix};
 use crate::artifacts::SceneIndices;
 use crate::codec::Artifact;
 use crate::config::Config;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
-use crate::scene::{Block, SceneFile};
+use crate::scene::{Block, NO_ALTITUDE, SceneFile, has_altitude};
 use crate::stages;
 
 /// The jobs of a scene.
@@ -53,6 +54,8 @@ struct OrderedModel {
     images: Vec<SourceImage>,
     /// Where these are in the list of the images given.
     order: Vec<usize>,
+    /// Where they were measured about the origin.
+    positions: Vec<Option<MeasuredPosition>>,
     origin: Option<Wgs84>,
 }
 
@@ -75,7 +78,7 @@ fn add_ordered_model(
     let positions: Vec<Option<MeasuredPosition>> = order.iter().map(|&at| listed[at]).collect();
     let source = ModelSource { images: &images, positions: &positions, pairs: &pairs };
     let jobs = add_model(graph, ModelKind::Scene, "scene", source, config, seed)?;
-    Ok(OrderedModel { jobs, images, order, origin })
+    Ok(OrderedModel { jobs, images, order, positions, origin })
 }
 
 /// Adds all jobs from image files to the model that tells guessed cameras; `alike` are pairs of images that look alike.
@@ -108,7 +111,8 @@ pub fn add_scene(
     config: &Config,
     seed: u64,
 ) -> Result<SceneJobs> {
-    let OrderedModel { jobs, images, order, origin } = add_ordered_model(graph, images, alike, config, seed)?;
+    let OrderedModel { jobs, images, order, positions, origin } =
+        add_ordered_model(graph, images, alike, config, seed)?;
     let index_params = config.index.clone();
     let index_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
@@ -137,7 +141,11 @@ pub fn add_scene(
     }
     let names: Vec<String> = images.iter().map(|image| image.name.clone()).collect();
     let config = config.scene_toml()?;
-    let params = json!({ "names": names, "origin": origin, "config": config });
+    let has_altitudes = positions.iter().flatten().any(|position| position.has_height);
+    let mut params = json!({ "names": names, "origin": origin, "config": config });
+    if origin.is_some() {
+        params["positions"] = json!(positions);
+    }
     let scene_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
         let indices = inputs.get::<SceneIndices>("index")?;
@@ -154,6 +162,12 @@ pub fn add_scene(
         let recall = worst_recall(&indices.0);
         let georegistrations = || output.report.georegistrations.iter().map(Option::is_some);
         let origin = origin.filter(|_| georegistrations().next() == Some(true));
+        let origin = origin.map(|at| if has_altitudes { at } else { Wgs84 { alt: NO_ALTITUDE, ..at } });
+        let fixes = fixes_of(&output, &positions);
+        let listed = names.len();
+        let relative = origin.filter(|origin| !has_altitude(*origin)).map(|_| {
+            "the measured positions have no altitudes: heights are relative, and left out where WGS84 is told".to_owned()
+        });
         Product::new(SceneFile {
             components,
             indices: copy,
@@ -162,9 +176,12 @@ pub fn add_scene(
             origin,
             warnings: (output.report.warnings.iter().map(|text| with_names(text, &names)))
                 .chain(recall.as_ref().filter(|recall| recall.share < MIN_RECALL).map(Recall::warning))
+                .chain(fixes.as_deref().and_then(positions::warning))
                 .collect(),
             notes: (output.report.merges.iter().filter_map(MergeRecord::sentence))
                 .chain(recall.as_ref().map(Recall::note))
+                .chain(fixes.as_deref().map(|fixes| positions::note(fixes, listed)))
+                .chain(relative)
                 .collect(),
             config: config.clone(),
             grown: Vec::new(),
@@ -191,6 +208,12 @@ pub fn add_scene(
         features[at] = job;
     }
     Ok(SceneJobs { features, model: jobs.model, scene })
+}
+
+/// The measured images of the largest component, where they place it.
+fn fixes_of(output: &MapperOutput, measured: &[Option<MeasuredPosition>]) -> Option<Vec<Fix>> {
+    let placed = output.report.georegistrations.first()?.as_ref()?;
+    Some(positions::fixes(output.components.first()?, placed, measured))
 }
 
 /// Keypoints of an image that go into the scene file, of the bright and of the dark; twice as many cost 200

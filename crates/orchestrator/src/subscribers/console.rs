@@ -101,7 +101,9 @@ impl Observer for Console {
                 *self.state.lock().unwrap_or_else(PoisonError::into_inner) = State { bars, stages };
             }
             Event::Hit { kind, .. } => self.step(kind, true),
-            Event::Finished { kind, .. } | Event::Skipped { kind, .. } => self.step(kind, false),
+            Event::Finished { kind, .. } | Event::Unkept { kind, .. } | Event::Skipped { kind, .. } => {
+                self.step(kind, false);
+            }
             Event::Failed { kind, job, reason } => {
                 self.tell(&format!("warning: {kind} {job}: {reason}"));
                 self.step(kind, false);

@@ -114,7 +114,9 @@ impl Observer for RunReport {
                 stages.spans.entry(kind).or_default().push((end - wall_secs, end));
             }
             Event::Hit { kind, .. } => self.with(kind, |report| report.cached += 1),
-            Event::Failed { kind, .. } => self.with(kind, |report| report.failed += 1),
+            Event::Failed { kind, .. } | Event::Unkept { kind, .. } => {
+                self.with(kind, |report| report.failed += 1);
+            }
             _ => {}
         }
     }
