@@ -57,7 +57,8 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 20: all components of a scene are searched. 21: matches that tell no distance are named. 22: intrinsics that are not
 /// known are free under what holds for usual photos. 23: what lies on the ground alone localizes nothing.
 /// 24: what several photos alone contradict is not trusted. 25: unknown cameras may be fisheyes.
-pub const VERSION: u32 = 25;
+/// 26: far walls are no ground, and one standpoint contradicts a local model once.
+pub const VERSION: u32 = 26;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

@@ -90,8 +90,8 @@ pub(crate) struct TiedPoint {
 /// Moves photos and local points (the paper's T_OPT), scene points within what the scene knows of them; returns
 /// covariances of the poses if asked.
 ///
-/// Cameras that are not known are estimated, from what holds for usual photos on. Poses without any observation stay where
-/// they are.
+/// Cameras that are not known are estimated, from what holds for usual photos on. Poses of fewer than three observations stay
+/// where they are.
 pub(crate) fn refine_jointly(
     model: &mut JointModel,
     scene: &Scene<'_>,

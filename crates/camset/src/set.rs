@@ -394,23 +394,35 @@ mod tests {
         assert!(target.links.len() > 2 && target.weakest().is_some_and(|link| link.shared >= 12));
     }
 
+    /// Locates the photos of a world as a set, with what was found of them alone changed.
+    fn locate_with_alone(
+        world: &World,
+        change: impl Fn(&mut [SingleLocalization]),
+    ) -> (Vec<SingleLocalization>, SetLocalization) {
+        let (scene, queries) = (world.scene(), world.queries());
+        let alone = queries.iter().map(|photo| locate_single(&SingleParams::default(), &scene, photo, 7));
+        let mut alone: Vec<SingleLocalization> = alone.collect();
+        change(&mut alone);
+        let models = std::slice::from_ref(&world.local);
+        let params = CamsetParams::default();
+        let found = locate_with(&params, &scene, (&*queries, &*alone), models, Views::default, 7);
+        (alone, found)
+    }
+
+    fn move_away(alone: &mut SingleLocalization) {
+        if let Some(pose) = &mut alone.photo.world_from_camera {
+            pose.translation.z += 8.0;
+        }
+    }
+
     #[test]
     fn a_local_model_that_several_photos_contradict_localizes_nothing() {
         let world = World::chain(9, 0.2, 1);
-        let (scene, queries) = (world.scene(), world.queries());
         let located = |moved: usize| {
-            let alone = queries.iter().map(|photo| locate_single(&SingleParams::default(), &scene, photo, 7));
-            let mut alone: Vec<SingleLocalization> = alone.collect();
-            let localized = |photo: &&mut SingleLocalization| photo.photo.verdict == Verdict::Localized;
-            for alone in alone.iter_mut().filter(localized).take(moved) {
-                if let Some(pose) = &mut alone.photo.world_from_camera {
-                    pose.translation.z += 8.0;
-                }
-            }
-            let models = std::slice::from_ref(&world.local);
-            let params = CamsetParams::default();
-            let found = locate_with(&params, &scene, (&*queries, &*alone), models, Views::default, 7);
-            (alone, found)
+            locate_with_alone(&world, |alone| {
+                let localized = |photo: &&mut SingleLocalization| photo.photo.verdict == Verdict::Localized;
+                alone.iter_mut().filter(localized).take(moved).for_each(move_away);
+            })
         };
         let (_, found) = located(1);
         let verdicts = found.refined.iter().map(|photo| photo.verdict);
@@ -430,6 +442,26 @@ mod tests {
         assert!(found.rigid.iter().all(|photo| photo.verdict != Verdict::Localized));
         assert!(found.contradicted.is_empty());
         assert_ne!(found.refined[8].verdict, Verdict::Localized);
+    }
+
+    #[test]
+    fn one_photo_that_contradicts_counts_once_whatever_its_standpoint_has() {
+        let turned = |i: u32| {
+            let center = Vector3::new(0.5, -1.5, 20.0 + 6.0 * f64::from(i / 2));
+            along_street(center, if i.is_multiple_of(2) { -0.1 } else { 0.9 })
+        };
+        let world = World::new(&Place::street(3500, 11), &(0..8).map(turned).collect::<Vec<_>>(), 0.2, 11);
+        let (alone, found) = locate_with_alone(&world, |alone| {
+            move_away(&mut alone[0]);
+            alone[1].photo.verdict = Verdict::Uncertain;
+        });
+        assert_eq!(alone[0].photo.verdict, Verdict::Localized);
+        assert_eq!(found.contradicted, [found.refined[0].name.clone()]);
+        assert!(found.refined[..2].iter().all(|photo| photo.verdict == Verdict::Uncertain));
+        let said = |at: usize| found.refined[at].reasons.join("; ");
+        assert!(said(0).contains("localized alone, it stands elsewhere"), "{}", said(0));
+        assert!(said(1).contains("another photo of its standpoint stands elsewhere"), "{}", said(1));
+        assert!(found.refined[2..].iter().all(|photo| photo.verdict == Verdict::Localized));
     }
 
     #[test]

@@ -32,11 +32,14 @@ impl Underfoot {
 
     /// How many of some points do not lie on the ground under the cameras that see them; each with that camera's centre.
     ///
-    /// The ground is where half of them lie, if that is below the cameras. Paving that repeats itself supports a wrong pose
-    /// as well as the right one, however many points agree: what stands on the ground has to agree, too.
+    /// The ground is at the median of their heights, if the median of their rays goes below the horizon: far walls lie about
+    /// it. Paving that repeats itself supports a wrong pose as well as the right one, however many points agree: what
+    /// stands on the ground has to agree, too.
     pub(crate) fn count_elsewhere(&self, seen: &[(Vector3<f64>, Vector3<f64>)]) -> usize {
         let below: Vec<f64> = seen.iter().map(|(center, point)| (point - center).dot(&self.down)).collect();
-        let Some(height) = median(below.clone()).filter(|height| *height > 0.0) else {
+        let slopes = seen.iter().zip(&below).map(|((center, point), below)| below / (point - center).norm());
+        let is_below = median(slopes.collect()).is_some_and(|slope| slope > BELOW_HORIZON);
+        let Some(height) = median(below.clone()).filter(|height| is_below && *height > 0.0) else {
             return seen.len();
         };
         let is_elsewhere = |((center, point), below): &(&(Vector3<f64>, Vector3<f64>), f64)| {
@@ -77,6 +80,9 @@ mod tests {
     fn a_wall_is_no_ground() {
         let wall: Vec<[f64; 3]> = (0..24).map(|at| [f64::from(at % 6), 10.0, f64::from(at / 6)]).collect();
         assert!(seen_from(1.6, &wall) >= 12);
+        // Far off, all of it lies about the horizon.
+        let far: Vec<[f64; 3]> = wall.iter().map(|[x, _, z]| [*x, 40.0, *z]).collect();
+        assert_eq!(seen_from(1.6, &far), 24);
         // All of it above the camera.
         let above: Vec<[f64; 3]> = wall.iter().map(|[x, y, z]| [*x, *y, z + 3.0]).collect();
         assert_eq!(seen_from(1.6, &above), 24);

@@ -34,7 +34,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 16;
+pub const ALIGNMENT_VERSION: u32 = 17;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;
@@ -477,18 +477,19 @@ impl<'a> Tracks<'a> {
         };
         let mut pose_of_image = vec![None; component.images.len()];
         let mut users = vec![0; component.cameras.len()];
-        let mut points_of = vec![0; component.cameras.len()];
+        let mut held_of = vec![0; component.cameras.len()];
         for (index, image) in component.images.iter().enumerate() {
             if let Some(world_from_camera) = image.world_from_camera {
                 pose_of_image[index] = Some(problem.poses.len() as u32);
                 let fixed = problem.poses.is_empty() || self.seen[index].len() < MIN_ADJUSTABLE_POINTS;
                 problem.poses.push(BundlePose { camera: image.camera.0, world_from_camera, fixed });
                 users[image.camera.index()] += 1;
-                points_of[image.camera.index()] += self.seen[index].len();
+                let is_held = |&&(point, _): &&(usize, usize)| component.points[point].track.len() > 2;
+                held_of[image.camera.index()] += self.seen[index].iter().filter(is_held).count();
             }
         }
         for (camera, freedom) in problem.camera_freedom.iter_mut().enumerate() {
-            let is_told = users[camera] >= 2 || points_of[camera] >= MIN_CALIBRATING_POINTS;
+            let is_told = users[camera] >= 2 || held_of[camera] >= MIN_CALIBRATING_POINTS;
             if camera_fixed.get(camera) == Some(&false) && is_told {
                 *freedom = IntrinsicsFreedom::FREE;
                 let usual = CameraPrior::of_usual_photo(camera as u32, &component.cameras[camera]);

@@ -24,7 +24,7 @@ mod test_street;
 pub(crate) mod wall;
 mod witnesses;
 
-use std::collections::BTreeMap;
+use std::{cmp::Reverse, collections::BTreeMap};
 
 use nalgebra::{UnitQuaternion, Vector3};
 use rayon::prelude::*;
@@ -64,7 +64,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 29;
+pub const MAPPER_VERSION: u32 = 30;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -378,7 +378,7 @@ fn grow_again(
         report.registrations.append(&mut mapper.records);
         parts[at] = mapper.into_part();
     }
-    parts.sort_by_key(|part| std::cmp::Reverse(part.component.registered().count()));
+    parts.sort_by_key(|part| Reverse(part.component.registered().count()));
     parts
 }
 
@@ -399,6 +399,10 @@ fn finished(
         }
         components.push(component);
     }
+    // Images that were left out may change which is the largest.
+    let size = |component: &Reconstruction| component.registered().count();
+    components.retain(|component| size(component) >= 2);
+    components.sort_by_key(|component| Reverse(size(component)));
     MapperOutput { components, open_pairs: Vec::new(), report }
 }
 
@@ -652,7 +656,7 @@ impl<'a> Mapper<'a> {
     /// ratio test over the whole image refused. Many such matches are wrong, but only the right length is one that many
     /// agree on.
     fn register_by_baseline(&mut self) -> Option<ImageId> {
-        let mut best: Option<(usize, ImageId, PoseHypothesis)> = None;
+        let mut found: Vec<(Edge, PoseHypothesis)> = Vec::new();
         for edge in self.open_edges() {
             // Nothing new can be found until the other image has other points.
             let points = self.model.observed_points(edge.other);
@@ -662,17 +666,20 @@ impl<'a> Mapper<'a> {
             let Edge { image, other, image_from_other, .. } = edge;
             let hypothesis =
                 hypothesize_baseline(&self.model, image, other, &image_from_other, &self.params.ransac());
-            if let Some(pose) = hypothesis
-                && best.as_ref().is_none_or(|(most, ..)| pose.inliers.len() > *most)
-            {
-                best = Some((pose.inliers.len(), image, pose));
-            }
+            found.extend(hypothesis.map(|pose| (edge, pose)));
         }
-        let (_, image, pose) = best?;
+        found.sort_by_key(|(_, pose)| Reverse(pose.inliers.len()));
+        let mut found = found.into_iter();
         let mut records = Vec::new();
-        let pose = self.first_accepted(image, vec![pose], &mut records);
+        let accepted = found.by_ref().find_map(|(edge, pose)| {
+            Some((edge.image, self.first_accepted(edge.image, vec![pose], &mut records)?))
+        });
         self.records.append(&mut records);
-        let pose = pose?;
+        // Those that were not looked at come again.
+        for (edge, _) in found {
+            self.baseline_tried.remove(&edge.pair);
+        }
+        let (image, pose) = accepted?;
         register(&mut self.model, image, &pose);
         Some(image)
     }
@@ -682,7 +689,7 @@ impl<'a> Mapper<'a> {
         if !self.params.continue_planes {
             return None;
         }
-        let mut best: Option<Continued> = None;
+        let mut found: Vec<(usize, Continued)> = Vec::new();
         for edge in self.open_edges() {
             let points = self.model.observed_points(edge.other);
             if self.planes_tried.insert(edge.pair, points) == Some(points) {
@@ -693,22 +700,26 @@ impl<'a> Mapper<'a> {
             let turned = |m: &Match| if *first == other { *m } else { m.swapped() };
             let verified: Vec<Match> = two_view.inliers.iter().map(turned).collect();
             let seed = self.seed ^ ((pair as u64) << 32);
-            let found = continue_planes(&self.model, image, other, (&image_from_other, &verified), seed);
-            if let Some(found) = found
-                && best.as_ref().is_none_or(|best| found.length.votes > best.length.votes)
-            {
-                best = Some(found);
-            }
+            let continued = continue_planes(&self.model, image, other, (&image_from_other, &verified), seed);
+            found.extend(continued.map(|continued| (pair, continued)));
         }
-        let Continued { world_from_camera, length, matches } = best?;
-        let BaselineLength { from, to: image, votes, .. } = length;
-        let visibility = visibility(&self.model, image, &world_from_camera, &[]);
-        let hypothesis =
-            PoseHypothesis { world_from_camera, inliers: Vec::new(), candidates: votes, visibility };
+        found.sort_by_key(|(_, continued)| Reverse(continued.length.votes));
+        let mut found = found.into_iter();
         let mut records = Vec::new();
-        let pose = self.first_accepted(image, vec![hypothesis], &mut records);
+        let accepted = found.by_ref().find_map(|(_, continued)| {
+            let Continued { world_from_camera, length: BaselineLength { to, votes, .. }, .. } = continued;
+            let visibility = visibility(&self.model, to, &world_from_camera, &[]);
+            let hypothesis =
+                PoseHypothesis { world_from_camera, inliers: Vec::new(), candidates: votes, visibility };
+            Some((self.first_accepted(to, vec![hypothesis], &mut records)?, continued))
+        });
         self.records.append(&mut records);
-        register(&mut self.model, image, &pose?);
+        for (pair, _) in found {
+            self.planes_tried.remove(&pair);
+        }
+        let (pose, Continued { length, matches, .. }) = accepted?;
+        let BaselineLength { from, to: image, .. } = length;
+        register(&mut self.model, image, &pose);
         self.model.lengths.push(length);
         for m in matches {
             let [a, b] =
@@ -803,7 +814,7 @@ impl<'a> Mapper<'a> {
                     && count > self.refused_at[image.index()] * 11 / 10
             })
             .collect();
-        waiting.sort_by_key(|&(count, image)| (std::cmp::Reverse(count), image));
+        waiting.sort_by_key(|&(count, image)| (Reverse(count), image));
         let mut best: Option<(ImageId, PoseHypothesis)> = None;
         // The first few in any case, the others until one is acceptable.
         let (few, others) = waiting.split_at(waiting.len().min(3));

@@ -36,8 +36,8 @@ const MIN_KEPT: f64 = 0.5;
 /// Fewest matches seen from elsewhere than the rest that give a set its scale at all.
 const MIN_FOR_SCALE: usize = 3;
 
-/// Photos localized alone elsewhere than their local model has them, from which on it is not trusted: one may be wrong
-/// itself.
+/// Standpoints with a photo that is localized alone elsewhere than its local model has it, from which on the model is not
+/// trusted: one may be wrong itself.
 const MIN_CONTRADICTING: usize = 2;
 
 /// Scales at which a set is tried to see what it shows by chance; nearer ones show some of what the right one does.
@@ -265,8 +265,10 @@ impl Component<'_> {
         }
         let (mut refined, mut elsewhere_alone) =
             self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
-        let is_distrusted =
-            elsewhere_alone.iter().filter(|elsewhere| **elsewhere).count() >= MIN_CONTRADICTING;
+        let contradicted: BTreeSet<usize> = (joint.model.photos.iter().zip(&elsewhere_alone))
+            .filter_map(|(photo, elsewhere)| elsewhere.then_some(photo.standpoint))
+            .collect();
+        let is_distrusted = contradicted.len() >= MIN_CONTRADICTING;
         let mut without_scale = Vec::new();
         if has_scale
             && elsewhere.max(joint.seen_from_elsewhere()).max(joint.viewed_from_elsewhere) < MIN_FOR_SCALE
@@ -967,15 +969,16 @@ impl Component<'_> {
                     ));
                     verdict = weaker(verdict, Verdict::Uncertain);
                 }
-                let seen_alone = self.seen_alone(&joint.model.photos, slot, depth);
-                match seen_alone {
+                let is_elsewhere = self.agrees_alone(&joint.model.photos, slot, depth) == Some(false);
+                match self.standpoint_agrees_alone(&joint.model.photos, slot, depth) {
                     // The photos' own matches are evidence that the set's pose did not create.
                     Some(true) => {
                         reasons.push("localized alone, it stands at the same place".to_owned());
                         verdict = Verdict::Localized;
                     }
                     Some(false) => {
-                        reasons.push("localized alone, it stands elsewhere".to_owned());
+                        let which = if is_elsewhere { "it" } else { "another photo of its standpoint" };
+                        reasons.push(format!("localized alone, {which} stands elsewhere"));
                         verdict = Verdict::Uncertain;
                     }
                     None => {}
@@ -995,21 +998,22 @@ impl Component<'_> {
                     verdict,
                     reasons,
                 };
-                (answer, seen_alone == Some(false))
+                (answer, is_elsewhere)
             })
             .unzip()
     }
 
-    /// Whether the photo, or another of its standpoint, stands at the same place when localized alone; `None` when
-    /// none is.
-    fn seen_alone(&self, joint: &[JointPhoto], slot: usize, depth: f64) -> Option<bool> {
-        let agreements = joint.iter().zip(self.members).filter_map(|(photo, &member)| {
-            let alone = &self.evidence[member].photo;
-            let other = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized)?;
-            (photo.standpoint == joint[slot].standpoint)
-                .then(|| same_pose(&photo.world_from_camera, &other, depth))
-        });
-        agreements.reduce(|a, b| a && b)
+    /// Whether the photo stands at the same place when localized alone; `None` when it is not.
+    fn agrees_alone(&self, joint: &[JointPhoto], slot: usize, depth: f64) -> Option<bool> {
+        let alone = &self.evidence[self.members[slot]].photo;
+        let own = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized)?;
+        Some(same_pose(&joint[slot].world_from_camera, &own, depth))
+    }
+
+    /// The same of all photos of its standpoint.
+    fn standpoint_agrees_alone(&self, joint: &[JointPhoto], slot: usize, depth: f64) -> Option<bool> {
+        let mates = (0..joint.len()).filter(|&mate| joint[mate].standpoint == joint[slot].standpoint);
+        mates.filter_map(|mate| self.agrees_alone(joint, mate, depth)).reduce(|a, b| a && b)
     }
 
     /// Median distance from a photo to the scene points that it sees, else to those that other photos from its standpoint

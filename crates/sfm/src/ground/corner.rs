@@ -170,7 +170,7 @@ impl Search<'_> {
         self.from.frame_in(self.to, &self.second_from_first(state), &self.ground(state), pixel)
     }
 
-    /// The place and its derivatives, each by half a step to either side.
+    /// The place and its derivatives, each by a step to either side.
     fn linear(
         &self,
         state: &State,

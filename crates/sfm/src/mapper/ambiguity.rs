@@ -70,7 +70,9 @@ fn rivals(
     let (mut bearings, mut sigmas, mut points) = (Vec::new(), Vec::new(), Vec::new());
     let known = model.placed_by_others(image);
     for (feature, id) in known.iter().step_by(known.len().div_ceil(MOST_POINTS).max(1)).copied() {
-        if let Some(point) = model.point(id) {
+        if let Some(point) = model.point(id)
+            && rays.sigmas[feature as usize].is_finite()
+        {
             bearings.push(rays.bearings[feature as usize]);
             sigmas.push(WIDER * rays.sigmas[feature as usize]);
             points.push(point.position);

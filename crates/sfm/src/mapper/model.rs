@@ -189,14 +189,16 @@ impl<'a> Model<'a> {
     /// Chord between the observed ray and the direction to a point, in standard deviations of the ray.
     ///
     /// The chord of the sphere (the paper's residual) is monotonic in the angle up to 180°, so a point behind a ray
-    /// has the largest error of all. `None` when the image is not registered.
+    /// has the largest error of all. `None` when the image is not registered, and of a keypoint that its camera has no
+    /// ray for.
     pub fn error_sigma(&self, observation: Observation, position: &Vector3<f64>) -> Option<f64> {
         let pose = self.poses[observation.image.index()].as_ref()?;
         let rays = &self.rays[observation.image.index()];
         let index = observation.feature as usize;
         let direction = pose.camera_from_world * (position - pose.center());
         let norm = direction.norm();
-        (norm > 0.0).then(|| (rays.bearings[index] - direction / norm).norm() / rays.sigmas[index])
+        (norm > 0.0 && rays.sigmas[index].is_finite())
+            .then(|| (rays.bearings[index] - direction / norm).norm() / rays.sigmas[index])
     }
 
     pub fn world_ray(&self, observation: Observation) -> Option<WorldRay> {

@@ -101,8 +101,9 @@ pub(super) fn hypothesize(
     seed: u64,
 ) -> Vec<PoseHypothesis> {
     let mut matches = scene_matches(model, graph, image);
-    let candidates = matches.len();
     let rays = &model.rays[image.index()];
+    matches.retain(|(feature, _)| rays.sigmas[*feature as usize].is_finite());
+    let candidates = matches.len();
     let mut hypotheses = Vec::new();
     for round in 0..max_hypotheses {
         let bearings: Vec<Vector3<f64>> =

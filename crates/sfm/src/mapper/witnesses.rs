@@ -29,7 +29,7 @@ pub(super) fn count_on_circles(
         let (a, b) = (m.first as usize, m.second as usize);
         let (forth, back) = (second_from_ray * first.bearings[a], first_from_ray * second.bearings[b]);
         let sigma = (forth.norm() * second.sigmas[b]).hypot(back.norm() * first.sigmas[a]);
-        second.bearings[b].dot(&forth).abs() <= max_error_sigma * sigma
+        sigma.is_finite() && second.bearings[b].dot(&forth).abs() <= max_error_sigma * sigma
     };
     matches.iter().filter(agrees).count()
 }
