@@ -25,6 +25,9 @@ use crate::{
 const MIN_AGREEING: usize = 30;
 /// How many times more matches have to agree with the estimate than with the guess.
 const GAIN: f64 = 1.2;
+/// How many times more have to agree with a fisheye than with another lens: where the model is poor, its further terms fit
+/// that.
+const FISHEYE_GAIN: f64 = 1.5;
 /// Focal lengths that are looked at, in longer sides of the image: views of 120° to 10°.
 const FOCAL_RANGE: (f64, f64) = (0.29, 6.0);
 /// Times that pose and intrinsics are adjusted on what agrees by then.
@@ -68,7 +71,7 @@ impl Seen<'_> {
         let usual = self.rectilinear(guess, params, seed);
         let fisheye = self.fisheye(guess, params, seed);
         let support = |found: &Option<(_, usize)>| found.as_ref().map_or(0, |(_, agreeing)| *agreeing);
-        if support(&fisheye) as f64 > GAIN * support(&usual) as f64 { fisheye } else { usual }
+        if support(&fisheye) as f64 > FISHEYE_GAIN * support(&usual) as f64 { fisheye } else { usual }
     }
 
     /// A camera by focal length and pose in one.
@@ -98,7 +101,7 @@ impl Seen<'_> {
         };
         let guesses = Camera::fisheye_guesses(guess.width, guess.height).filter_map(with_pose);
         let (camera, pose, agreeing) = guesses.max_by_key(|(.., agreeing)| agreeing.len())?;
-        self.improved(camera, pose, agreeing)
+        self.improved(camera, pose, agreeing).filter(|(camera, _)| camera.is_wide())
     }
 
     /// Camera and pose, adjusted to what agrees until that is all that does, and how much it is.
