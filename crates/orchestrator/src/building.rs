@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::Result;
 use rayon::prelude::*;
 use setloc_features::{Calibration, Camera, ImageFeatures};
-use setloc_sfm::{ImageId, MapperOutput, Reconstruction, ReconstructionPoint};
+use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
 
 use crate::artifacts::LikelyImages;
 use crate::config::Config;
@@ -139,9 +139,6 @@ pub fn estimate_cameras(
 /// Images of a camera that tell it well enough to replace a guess.
 const MIN_IMAGES: usize = 3;
 
-/// Points, each seen by three images or more, that make fewer images do.
-const MIN_HELD_POINTS: usize = 30;
-
 /// The images with the cameras of a model in place of guessed ones; `None` when it tells none.
 ///
 /// Images of one guess have one camera: that of the component that has registered most of them.
@@ -158,10 +155,7 @@ fn with_estimated_cameras(
         component.registered().filter(is_of_guess).collect()
     };
     let is_told = |component: &Reconstruction, images: &[ImageId]| {
-        let shows = |point: &&ReconstructionPoint| {
-            point.track.len() >= 3 && point.track.iter().any(|seen| images.contains(&seen.image))
-        };
-        images.len() >= MIN_IMAGES || component.points.iter().filter(shows).count() >= MIN_HELD_POINTS
+        images.len() >= MIN_IMAGES || component.tells_camera_of(images)
     };
     let told = |guess: &Camera| {
         // Of equal numbers the last counts most: that of the larger component.

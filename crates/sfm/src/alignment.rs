@@ -29,7 +29,7 @@ use crate::{
         self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, CameraPrior,
         IntrinsicsFreedom, RobustLoss,
     },
-    mapper::{MIN_ADJUSTABLE_POINTS, MIN_CALIBRATING_POINTS},
+    mapper::MIN_ADJUSTABLE_POINTS,
     solvers::tangent_basis,
 };
 
@@ -476,21 +476,18 @@ impl<'a> Tracks<'a> {
             ..BundleProblem::default()
         };
         let mut pose_of_image = vec![None; component.images.len()];
-        let mut users = vec![0; component.cameras.len()];
-        let mut held_of = vec![0; component.cameras.len()];
+        let mut users = vec![Vec::new(); component.cameras.len()];
         for (index, image) in component.images.iter().enumerate() {
             if let Some(world_from_camera) = image.world_from_camera {
                 pose_of_image[index] = Some(problem.poses.len() as u32);
                 let fixed = problem.poses.is_empty() || self.seen[index].len() < MIN_ADJUSTABLE_POINTS;
                 problem.poses.push(BundlePose { camera: image.camera.0, world_from_camera, fixed });
-                users[image.camera.index()] += 1;
-                let is_held = |&&(point, _): &&(usize, usize)| component.points[point].track.len() > 2;
-                held_of[image.camera.index()] += self.seen[index].iter().filter(is_held).count();
+                users[image.camera.index()].push(ImageId(index as u32));
             }
         }
         for (camera, freedom) in problem.camera_freedom.iter_mut().enumerate() {
-            let is_told = users[camera] >= 2 || held_of[camera] >= MIN_CALIBRATING_POINTS;
-            if camera_fixed.get(camera) == Some(&false) && is_told {
+            let is_told = || users[camera].len() >= 2 || component.tells_camera_of(&users[camera]);
+            if camera_fixed.get(camera) == Some(&false) && is_told() {
                 *freedom = IntrinsicsFreedom::FREE;
                 let usual = CameraPrior::of_usual_photo(camera as u32, &component.cameras[camera]);
                 problem.camera_priors.extend(usual);

@@ -5,6 +5,7 @@ use setloc_features::{Camera, Keypoint};
 use crate::{
     Rigid, Similarity,
     bundle::{BundleProblem, LengthRatio},
+    mapper::MIN_CALIBRATING_POINTS,
 };
 
 macro_rules! id {
@@ -274,6 +275,14 @@ impl Reconstruction {
     /// The camera of an image.
     pub fn camera_of(&self, image: ImageId) -> &Camera {
         &self.cameras[self.images[image.index()].camera.index()]
+    }
+
+    /// Whether images see enough points, each seen by three images at least, to tell their camera though they are few.
+    pub fn tells_camera_of(&self, images: &[ImageId]) -> bool {
+        let is_held = |point: &&ReconstructionPoint| {
+            point.track.len() >= 3 && point.track.iter().any(|seen| images.contains(&seen.image))
+        };
+        self.points.iter().filter(is_held).count() >= MIN_CALIBRATING_POINTS
     }
 
     /// Number of observations of all points.

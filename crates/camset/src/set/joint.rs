@@ -339,11 +339,10 @@ impl Component<'_> {
             let alone = &self.evidence[self.members[slot]].photo;
             if alone.verdict == Verdict::Localized {
                 photo.clone_from(alone);
-            }
-            photo.reasons.push(reason.clone());
-            if alone.verdict != Verdict::Localized {
+            } else {
                 photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
             }
+            photo.reasons.push(reason.clone());
         }
         for photo in rigid {
             photo.verdict = weaker(photo.verdict, Verdict::Uncertain);

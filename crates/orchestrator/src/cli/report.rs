@@ -5,7 +5,7 @@ use anyhow::Result;
 use super::Answer;
 use super::args::ReportArgs;
 use super::build::export_folder;
-use super::outputs::{refuse_folder, refuse_input};
+use super::outputs::{PICTURE, refuse_folder, refuse_input};
 use crate::digest::Digest;
 use crate::print;
 use crate::store::write_atomically;
@@ -16,7 +16,7 @@ pub fn run(args: &ReportArgs) -> Result<Answer> {
     let folder = if args.results.is_file() { export_folder(&args.results) } else { args.results.clone() };
     let page = args.output.clone().unwrap_or_else(|| folder.join("report.html"));
     refuse_folder("-o", &page, "report.html")?;
-    let read = ["poses.json", "report.json", "top_view.png"].map(|name| folder.join(name));
+    let read = ["poses.json", "report.json", PICTURE].map(|name| folder.join(name));
     let scene = folder.with_extension("setloc");
     refuse_input([&args.results, &scene].into_iter().chain(&read).map(PathBuf::as_path), &page)?;
     let digest = Digest::read(&folder)?;
