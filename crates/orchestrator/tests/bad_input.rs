@@ -207,6 +207,8 @@ fn results_among_the_photos_are_refused() {
         assert!(text.contains("would go into panoramas, among the images\nhint: "), "{text}");
         assert_eq!(std::fs::read_dir(folder.path().join("panoramas")).unwrap().count(), 2);
     }
+    let refused = run(&["locate", "s.setloc", "panoramas", "-o", "out", "--grow", "out.setloc"]);
+    assert!(said(&refused).contains("out would hold the results of both\nhint: "), "{}", said(&refused));
 }
 
 #[test]

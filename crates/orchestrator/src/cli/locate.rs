@@ -13,7 +13,7 @@ use super::args::LocateArgs;
 use super::build::{
     export_folder, listed, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
 };
-use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
+use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input, refuse_same_folder};
 use crate::dataset::{
     CameraBook, CameraOrigin, GeoSource, ImageFolder, SourceImage, list_images, unread_images,
 };
@@ -113,6 +113,7 @@ fn refuse_inputs(args: &LocateArgs, files: &[(String, PathBuf)]) -> Result<()> {
     refuse_folder("--grow", grown, "grown.setloc")?;
     let hint = "name the scene that has grown otherwise: its exports are in the folder of its name";
     refuse_image_folder(&args.photos, &export_folder(grown), hint)?;
+    refuse_same_folder(&export_folder(grown), &args.output, hint)?;
     let photos = files.iter().map(|(_, path)| path.as_path());
     let others = [args.cameras.as_deref(), args.run.config.as_deref()];
     refuse_input(photos.chain(others.into_iter().flatten()), grown)

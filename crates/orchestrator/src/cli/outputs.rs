@@ -46,6 +46,14 @@ pub fn refuse_image_folder(images: &[PathBuf], results: &Path, hint: &str) -> Re
     }
 }
 
+/// Refuses a folder into which other results of the same command go: both write `poses.json`.
+pub fn refuse_same_folder(results: &Path, others: &Path, hint: &str) -> Result<()> {
+    if std::path::absolute(results)? != std::path::absolute(others)? {
+        return Ok(());
+    }
+    Err(Hinted::error(format!("{} would hold the results of both", results.display()), hint))
+}
+
 /// The folder that is given, or that a given file is in.
 fn results_in(input: &Path) -> &Path {
     if input.is_dir() { input } else { input.parent().unwrap_or(input) }
@@ -73,6 +81,13 @@ mod tests {
         std::fs::write(&picture, "").unwrap();
         refuse(slice::from_ref(&photo), &street).unwrap();
         assert!(refuse(&[photo, picture], &street).is_err());
+    }
+
+    #[test]
+    fn a_folder_of_other_results_is_refused_whether_it_is_there_or_not() {
+        let refuse = |a: &str, b: &str| refuse_same_folder(Path::new(a), Path::new(b), "elsewhere");
+        assert!(refuse("out", "./out/").is_err());
+        refuse("out", "out2").unwrap();
     }
 
     #[test]

@@ -68,17 +68,37 @@ impl RunResult {
     }
 
     /// Adds what a further graph of the same command came to.
+    ///
+    /// A job that ran of other inputs before, in a first pass, say, is told apart by its label.
     pub fn absorb(&mut self, other: Self) {
-        // What this command made or found before is found again.
-        let is_hit = |label: &&String| other.ran.binary_search(label).is_err();
-        let again = other.keys.keys().filter(is_hit).filter(|label| self.keys.contains_key(*label)).count();
-        self.hits += other.hits.saturating_sub(again);
-        self.ran.extend(other.ran);
+        let ran: BTreeSet<String> = other.ran.into_iter().collect();
+        let mut found_again = 0;
+        for (label, key) in other.keys {
+            let apart = self.label_apart(&label, key);
+            if ran.contains(&label) {
+                self.ran.push(apart.clone());
+            } else if self.keys.contains_key(&apart) {
+                // What this command made or found before is found again.
+                found_again += 1;
+            }
+            self.keys.insert(apart, key);
+        }
+        self.hits += other.hits.saturating_sub(found_again);
         self.ran.sort();
         self.ran.dedup();
         self.failed.extend(other.failed);
-        self.keys.extend(other.keys);
     }
+
+    /// The first of a job's labels that has no other key.
+    fn label_apart(&self, label: &str, key: ContentHash) -> String {
+        let is_free = |label: &String| self.keys.get(label).is_none_or(|known| *known == key);
+        passes(label).find(is_free).unwrap_or_default()
+    }
+}
+
+/// The labels of a job that runs more than once in a command, each time of other inputs.
+pub fn passes(label: &str) -> impl Iterator<Item = String> {
+    std::iter::once(label.to_owned()).chain((2_u64..).map(move |pass| format!("{label} (pass {pass})")))
 }
 
 #[derive(Clone)]
@@ -602,6 +622,25 @@ mod tests {
         assert_eq!(result.failed["test bad"], "no light");
         assert!(result.failed["test worse"].contains("panicked"), "{:?}", result.failed);
         assert_eq!(result.keys.len(), 2);
+    }
+
+    #[test]
+    fn both_passes_of_a_job_are_in_what_a_command_came_to() {
+        let (key, label) = (|name: &str| ContentHash::of(name.as_bytes()), |name: &str| name.to_owned());
+        let ran = |job: &str, of: &str| RunResult {
+            ran: vec![label(job)],
+            keys: BTreeMap::from([(label(job), key(of)), (label("shared"), key("shared"))]),
+            hits: 1,
+            ..RunResult::default()
+        };
+        let mut whole = ran("model", "guess").and(ran("model", "estimate"));
+        assert_eq!(whole.ran, ["model", "model (pass 2)"]);
+        assert_eq!((whole.keys["model"], whole.keys["model (pass 2)"]), (key("guess"), key("estimate")));
+        // What both use was found once.
+        assert_eq!((whole.hits, whole.keys.len()), (1, 3));
+        let hit = RunResult { ran: Vec::new(), hits: 2, ..ran("model", "estimate") };
+        whole.absorb(hit);
+        assert_eq!((whole.hits, whole.keys.len()), (1, 3));
     }
 
     #[test]

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use petgraph::algo::toposort;
 use serde::Serialize;
 
+use super::executor::passes;
 use super::job::JobGraph;
 use crate::fingerprint::{ContentHash, Fingerprint};
 use crate::store::{RunRecord, Store};
@@ -74,11 +75,15 @@ impl JobGraph<'_> {
     }
 }
 
+/// What differs from the job's last run; from the nearest of its passes, where it had several.
 fn why(now: &Fingerprint, label: &str, store: &Store, last: &RunRecord) -> Vec<String> {
-    let Some(key) = last.jobs.get(label) else { return vec!["never ran before".to_owned()] };
-    let Some(before) = store.record(*key) else {
+    let mut keys = passes(label).map_while(|label| last.jobs.get(&label)).peekable();
+    if keys.peek().is_none() {
+        return vec!["never ran before".to_owned()];
+    }
+    let changes = |key: &ContentHash| Some(now.changes_since(&store.record(*key)?.fingerprint));
+    let Some(changes) = keys.filter_map(changes).min_by_key(Vec::len) else {
         return vec!["its last fingerprint is no longer kept".to_owned()];
     };
-    let changes = now.changes_since(&before.fingerprint);
     if changes.is_empty() { vec!["its result is no longer in the store".to_owned()] } else { changes }
 }
