@@ -8,7 +8,8 @@ use setloc_camset::{AnywhereLocalization, PhotoLocalization, SetLocalization, Ve
 use setloc_features::{Calibration, Camera};
 use setloc_sfm::MapperOutput;
 
-use crate::building::alike_pairs;
+use crate::building::{alike_pairs, estimate_cameras};
+use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, RunResult};
@@ -112,6 +113,7 @@ pub fn locate(
                 whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);
             }
             improve_lone_guesses(&mut folder.images, &located.single);
+            whole.absorb(improve_by_model(session, &mut folder.images, what, name)?);
             if mode == Mode::Set {
                 located.single.clear();
             }
@@ -155,6 +157,26 @@ fn improve_lone_guesses(images: &mut [SourceImage], alone: &[PhotoLocalization])
             image.camera.clone_from(&photo.camera);
         }
     }
+}
+
+/// Puts the cameras of a first model of the photos, as scenes have one, in place of guesses that few photos share.
+///
+/// A guess is a third too long or more, and pairs that are verified with it lose what lies off one wall.
+fn improve_by_model(
+    session: &Session,
+    images: &mut [SourceImage],
+    what: &LocateJobs,
+    name: &str,
+) -> Result<RunResult> {
+    let is_lone: Vec<bool> = images.iter().map(|image| is_lone_guess(images, image)).collect();
+    let config = Config { features: what.config.photo_features(), ..what.config.clone() };
+    let (alike, before) = alike_pairs(session, name, images, &config.features, &config)?;
+    let (told, run) = estimate_cameras(session, name, images, &alike, &config, what.seed)?;
+    let told = told.into_iter().flatten();
+    for ((image, told), _) in images.iter_mut().zip(told).zip(is_lone).filter(|(_, is_lone)| *is_lone) {
+        image.camera = told.camera;
+    }
+    Ok(before.and(run))
 }
 
 /// The images with the cameras that a set's localization tells in place of guessed ones; `None` when it tells none.

@@ -64,7 +64,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 31;
+pub const MAPPER_VERSION: u32 = 32;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -637,7 +637,8 @@ impl<'a> Mapper<'a> {
                 let open = !self.model.is_registered(image)
                     && !self.taken[image.index()]
                     && self.anchors[image.index()].is_none()
-                    && self.model.is_registered(anchor);
+                    && self.model.is_registered(anchor)
+                    && self.knows_camera_of(image);
                 if open && best.is_none_or(|(most, ..)| matches > most) {
                     best = Some((matches, image, anchor, image_from_anchor.rotation));
                 }
@@ -737,11 +738,24 @@ impl<'a> Mapper<'a> {
             let is_open = !self.model.is_registered(image)
                 && self.model.is_registered(other)
                 && !self.taken[image.index()]
+                && self.knows_camera_of(image)
                 && pair.two_view.kind != TwoViewKind::PureRotation
                 && pair.two_view.inliers.len() >= self.params.min_initial_points;
             is_open.then_some(Edge { pair: index, image, other, image_from_other })
         };
         self.model.input.pairs.iter().enumerate().filter_map(open).collect()
+    }
+
+    /// Whether anything has told the camera of an image that waits.
+    ///
+    /// The geometry of a pair under a guess of the focal length fits its matches, mostly those on one wall, and is wrong. Who
+    /// waits for points instead gets a camera with them.
+    fn knows_camera_of(&self, image: ImageId) -> bool {
+        let camera = self.model.input.images[image.index()].camera;
+        let is_of_camera = |id: ImageId| self.model.input.images[id.index()].camera == camera;
+        self.model.input.camera_fixed[camera.index()]
+            || !self.model.cameras[camera.index()].is_bare_guess()
+            || self.model.registered().any(is_of_camera)
     }
 
     /// Finds the intrinsics of unknown cameras that no registered image has, where a waiting image tells them.
@@ -769,6 +783,12 @@ impl<'a> Mapper<'a> {
                 self.model.refresh_rays(camera);
                 self.recalibrated[camera] = true;
                 is_settled[camera] = true;
+                // What was refused was refused under the guess.
+                for (image, refused_at) in self.model.input.images.iter().zip(&mut self.refused_at) {
+                    if image.camera.index() == camera {
+                        *refused_at = 0;
+                    }
+                }
             }
         }
     }

@@ -119,8 +119,16 @@ impl Corner {
     }
 
     fn map(&self, params: &MapperParams) -> MapperOutput {
+        self.map_target_of(&self.camera, params)
+    }
+
+    /// The model where the target is known to be of another camera, whose intrinsics are a guess.
+    fn map_target_of(&self, of_target: &Camera, params: &MapperParams) -> MapperOutput {
         let mut rng = ChaCha8Rng::seed_from_u64(99);
-        let rays: Vec<_> = self.features.iter().map(|features| features.rays(&self.camera)).collect();
+        let is_other = of_target != &self.camera;
+        let camera_of = |image: usize| if image == MODEL { of_target } else { &self.camera };
+        let rays: Vec<_> =
+            self.features.iter().enumerate().map(|(image, seen)| seen.rays(camera_of(image))).collect();
         let mut pairs = Vec::new();
         for a in 0..=MODEL {
             for b in a + 1..=MODEL {
@@ -143,10 +151,12 @@ impl Corner {
                 }
             }
         }
-        let images = self.features.iter().map(|features| InputImage::new("photo", CameraId(0), features));
+        let images = self.features.iter().enumerate().map(|(image, features)| {
+            InputImage::new("photo", CameraId(u32::from(is_other && image == MODEL)), features)
+        });
         let input = MapperInput {
-            cameras: vec![self.camera.clone()],
-            camera_fixed: vec![true],
+            cameras: vec![self.camera.clone(), of_target.clone()],
+            camera_fixed: vec![true, false],
             images: images.collect(),
             pairs: &pairs,
             putative: &[],
@@ -192,6 +202,19 @@ fn a_wall_that_goes_on_tells_the_length_within_its_deviation() {
         assert!((in_model - stated).abs() < 0.02, "seed {seed}: adjustment holds it, {in_model} {stated}");
         assert!(length.votes >= 10);
     }
+}
+
+#[test]
+fn planes_place_no_photo_whose_focal_length_nobody_told() {
+    let corner = Corner::new(STREET, 2);
+    let guess = Camera::from_focal_guess(1200, 900, 1440.0);
+    assert!(guess.is_bare_guess());
+    let output = corner.map_target_of(&guess, &MapperParams::default());
+    assert_eq!(registered(&output), MODEL, "{:?}", output.components[0].lengths);
+    let mut told = Camera::from_focal_guess(1200, 900, 800.0);
+    told.params[3] = 1e-6;
+    let output = corner.map_target_of(&told, &MapperParams::default());
+    assert_eq!(registered(&output), MODEL + 1, "{:?}", output.report.registrations);
 }
 
 #[test]

@@ -40,6 +40,9 @@ const MIN_FOR_SCALE: usize = 3;
 /// trusted: one may be wrong itself.
 const MIN_CONTRADICTING: usize = 2;
 
+/// Scene points that tell the focal length of a photo whose local model does not.
+const MIN_TELLING: usize = 30;
+
 /// Scales at which a set is tried to see what it shows by chance; nearer ones show some of what the right one does.
 const OTHER_SCALES: [f64; 10] = [0.15, 0.25, 0.35, 0.5, 0.6, 1.6, 2.0, 2.8, 4.0, 6.0];
 
@@ -980,7 +983,13 @@ impl Component<'_> {
                         reasons.push(format!("localized alone, {which} stands elsewhere"));
                         verdict = Verdict::Uncertain;
                     }
-                    None => {}
+                    None => {
+                        let seen = joint.direct[slot].len() + joint.viewed[slot];
+                        if seen < MIN_TELLING && !self.is_camera_told(slot) {
+                            reasons.push(format!("nothing but {seen} scene points tells its focal length"));
+                            verdict = weaker(verdict, Verdict::Uncertain);
+                        }
+                    }
                 }
                 let of_standpoint =
                     |to: usize| joint.model.photos[to].standpoint == joint.model.photos[slot].standpoint;
@@ -1000,6 +1009,17 @@ impl Component<'_> {
                 (answer, is_elsewhere)
             })
             .unzip()
+    }
+
+    /// Whether intrinsics are known, shared with another photo of the model or told by its points.
+    ///
+    /// With one other photo an unknown focal length fits as well as a step ahead does, and a few scene points fit both.
+    fn is_camera_told(&self, slot: usize) -> bool {
+        let photo = self.members[slot];
+        let shares = |other: &usize| *other != slot && self.camera_of(*other) == self.camera_of(slot);
+        self.photos[photo].calibration != Calibration::Guessed
+            || (0..self.members.len()).any(|other| shares(&other))
+            || self.model.tells_camera_of(&[ImageId(photo as u32)])
     }
 
     /// Whether the photo stands at the same place when localized alone; `None` when it is not.

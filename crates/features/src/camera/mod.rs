@@ -106,6 +106,11 @@ impl Camera {
         Self { model: CameraModel::Radial, width, height, params }
     }
 
+    /// Whether this is such a guess still, which nothing has improved.
+    pub fn is_bare_guess(&self) -> bool {
+        *self == Self::from_focal_guess(self.width, self.height, self.focal_length())
+    }
+
     /// Whether the image's diagonal shows more than some 90°, where fisheyes and other lenses differ by more than two
     /// radial terms take up.
     pub fn is_wide(&self) -> bool {
