@@ -207,7 +207,8 @@ fn a_wall_that_goes_on_tells_the_length_within_its_deviation() {
 #[test]
 fn planes_place_no_photo_whose_focal_length_nobody_told() {
     let corner = Corner::new(STREET, 2);
-    let guess = Camera::from_focal_guess(1200, 900, 1440.0);
+    // A guess that happens to be nearly right is one nonetheless.
+    let guess = Camera::from_focal_guess(1200, 900, 801.0);
     assert!(guess.is_bare_guess());
     let output = corner.map_target_of(&guess, &MapperParams::default());
     assert_eq!(registered(&output), MODEL, "{:?}", output.components[0].lengths);
