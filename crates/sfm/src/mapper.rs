@@ -751,11 +751,10 @@ impl<'a> Mapper<'a> {
     /// The geometry of a pair under a guess of the focal length fits its matches, mostly those on one wall, and is wrong. Who
     /// waits for points instead gets a camera with them.
     fn knows_camera_of(&self, image: ImageId) -> bool {
-        let camera = self.model.input.images[image.index()].camera;
-        let is_of_camera = |id: ImageId| self.model.input.images[id.index()].camera == camera;
-        self.model.input.camera_fixed[camera.index()]
-            || !self.model.cameras[camera.index()].is_bare_guess()
-            || self.model.registered().any(is_of_camera)
+        let camera = self.model.input.images[image.index()].camera.index();
+        self.model.input.camera_fixed[camera]
+            || !self.model.cameras[camera].is_bare_guess()
+            || !self.model.registered_with(camera).is_empty()
     }
 
     /// Finds the intrinsics of unknown cameras that no registered image has, where a waiting image tells them.

@@ -1016,9 +1016,9 @@ impl Component<'_> {
     /// With one other photo an unknown focal length fits as well as a step ahead does, and a few scene points fit both.
     fn is_camera_told(&self, slot: usize) -> bool {
         let photo = self.members[slot];
-        let shares = |other: &usize| *other != slot && self.camera_of(*other) == self.camera_of(slot);
+        let shares_it = |other: usize| other != slot && self.camera_of(other) == self.camera_of(slot);
         self.photos[photo].calibration != Calibration::Guessed
-            || (0..self.members.len()).any(|other| shares(&other))
+            || (0..self.members.len()).any(shares_it)
             || self.model.tells_camera_of(&[ImageId(photo as u32)])
     }
 
