@@ -59,7 +59,7 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 24: what several photos alone contradict is not trusted. 25: unknown cameras may be fisheyes.
 /// 26: far walls are no ground, and one standpoint contradicts a local model once.
 /// 27: what too little tells the focal length of is uncertain.
-pub const VERSION: u32 = 27;
+pub const VERSION: u32 = 28;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

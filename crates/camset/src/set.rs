@@ -9,15 +9,16 @@ mod sights;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use setloc_sfm::{CameraId, ImageId, Reconstruction, ReconstructionImage, Rigid};
+use setloc_sfm::{CameraId, ImageId, OutvotedPair, Reconstruction, ReconstructionImage, Rigid};
 
 use crate::advice::{Link, name_open_pairs, widest_paths};
 use crate::{
     CamsetParams, LocalModels, PhotoLocalization, PlacedModel, QueryPhoto, Scene, SetLocalization,
-    SingleLocalization, Verdict, Views, verdict::standard_deviations,
+    SingleLocalization, Verdict, Views,
+    verdict::{standard_deviations, weaker},
 };
 
-use joint::{Component, ComponentAnswer};
+use joint::{Component, ComponentAnswer, ComponentPoses};
 
 pub use merged::locate_set_anywhere;
 
@@ -178,7 +179,10 @@ fn locate_by(
         let seed = seed.wrapping_add(0x1000 * (number as u64 + 1));
         let component = Component { params, scene, photos, evidence, model, members: &members, views };
         match component.locate(seed) {
-            ComponentAnswer::Localized(found) => {
+            ComponentAnswer::Localized(mut found) => {
+                for pair in local_models.outvoted.get(number).into_iter().flatten() {
+                    doubt_beyond(pair, photos, evidence, &members, &mut found);
+                }
                 let (component, world_from_set) = (scene.component, found.world_from_set);
                 answer.placed.push(PlacedModel { component, world_from_set });
                 let seen_by_all: Vec<_> = members.iter().copied().zip(found.scene_points.clone()).collect();
@@ -220,6 +224,45 @@ fn locate_by(
         }
     }
     Answer { set: answer, remarks, elsewhere, seen }
+}
+
+/// Makes photos uncertain that the local model joins to those that the scene holds against more matches than points.
+///
+/// The side that more photos localized alone agree with is held, else the one that sees more of the scene. On the other only
+/// photos stay localized that are so alone, at the same place.
+fn doubt_beyond(
+    pair: &OutvotedPair,
+    photos: &[QueryPhoto<'_>],
+    evidence: &[&SingleLocalization],
+    members: &[usize],
+    found: &mut ComponentPoses,
+) {
+    let on_side: Vec<bool> =
+        members.iter().map(|&photo| pair.side.binary_search(&ImageId(photo as u32)).is_ok()).collect();
+    let agrees_alone =
+        |slot: usize| evidence[members[slot]].photo.verdict == Verdict::Localized && !found.elsewhere[slot];
+    let held = |side: bool| {
+        let slots = (0..members.len()).filter(|&slot| on_side[slot] == side);
+        slots
+            .map(|slot| (usize::from(agrees_alone(slot)), found.scene_points[slot]))
+            .fold((0, 0), |(alone, seen), (is_alone, points)| (alone + is_alone, seen + points))
+    };
+    let is_first_held = held(true) >= held(false);
+    let doubtful: Vec<usize> =
+        (0..members.len()).filter(|&slot| on_side[slot] != is_first_held && !agrees_alone(slot)).collect();
+    let [first, second] =
+        [pair.first, pair.second].map(|image| photos.get(image.index()).map_or("", |photo| photo.name));
+    let reason = format!(
+        "the {} matches of {first} and {second} contradict its local model, which {} points hold together between them",
+        pair.matches, pair.held_by
+    );
+    for slot in doubtful {
+        for photo in [&mut found.rigid[slot], &mut found.refined[slot]] {
+            photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
+            photo.reasons.push(reason.clone());
+        }
+    }
+    found.remarks.push(reason);
 }
 
 /// What photos that are placed together are called, and in which component where it is not the largest.
@@ -657,6 +700,43 @@ mod tests {
         let (rigid, refined) = (worst_errors(&world, &found.rigid), worst_errors(&world, &found.refined));
         assert!(refined.0 < 0.4 * rigid.0 && refined.1 < 0.4 * rigid.1, "{rigid:?} {refined:?}");
         assert!(refined.0 < 0.15 && refined.1 < 0.2, "{refined:?}");
+    }
+
+    #[test]
+    fn photos_that_outvoted_matches_speak_against_are_uncertain_but_where_they_are_localized_alone() {
+        let world = World::chain(9, 0.2, 3);
+        let photos = world.queries();
+        let alone: Vec<SingleLocalization> = photos
+            .iter()
+            .map(|photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7))
+            .collect();
+        let evidence: Vec<&SingleLocalization> = alone.iter().collect();
+        let locate = |side: Vec<ImageId>| {
+            let (first, second) = (ImageId(5), ImageId(6));
+            let outvoted = [vec![OutvotedPair { first, second, matches: 300, held_by: 60, side }]];
+            let models = LocalModels { outvoted: &outvoted, ..std::slice::from_ref(&world.local).into() };
+            let views = || Ok::<_, Infallible>(Views::default());
+            let (params, scene) = (CamsetParams::default(), world.scene());
+            locate_set(&params, &scene, &photos, &evidence, models, views, 7).unwrap()
+        };
+        let verdicts = |found: &SetLocalization| -> Vec<bool> {
+            found.refined.iter().map(|photo| photo.verdict == Verdict::Localized).collect()
+        };
+        assert_eq!(verdicts(&locate(first_photos(9))), [true; 9]);
+        // Whichever side the pair's first is on.
+        for side in [first_photos(6), (6..9).map(ImageId).collect()] {
+            let found = locate(side);
+            assert_eq!(verdicts(&found), [true, true, true, true, true, true, false, false, false]);
+            let reasons = &found.refined[8].reasons;
+            assert!(reasons.iter().any(|reason| reason.contains("300 matches")), "{reasons:?}");
+        }
+        // Photos that are localized alone stay so on the other side.
+        let by_themselves = alone.iter().filter(|found| found.photo.verdict == Verdict::Localized).count();
+        assert!(by_themselves >= 2 && verdicts(&locate(first_photos(1)))[..2] == [true; 2]);
+    }
+
+    fn first_photos(count: u32) -> Vec<ImageId> {
+        (0..count).map(ImageId).collect()
     }
 
     #[test]

@@ -9,7 +9,7 @@ use setloc_sfm::{ImageId, Rigid};
 use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
 use crate::guided::guided_matches;
 use crate::refine::{JointModel, JointObservations, JointPhoto, refine_jointly};
-use crate::underfoot::Underfoot;
+use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
 use crate::{PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, SingleParams, Verdict};
 
@@ -74,7 +74,8 @@ fn locate_with_nearest(
         );
         return (PhotoLocalization::not_localized(photo, scene.component, reason), Vec::new());
     }
-    let Some(found) = solve(params, scene, photo, nearest, &matches, seed) else {
+    let ground = Ground::of_scene(scene);
+    let Some(found) = solve(params, (scene, &ground), photo, nearest, &matches, seed) else {
         let reason = format!("no pose explains any of its {} matches to the scene", matches.len());
         return (PhotoLocalization::not_localized(photo, scene.component, reason), Vec::new());
     };
@@ -110,19 +111,20 @@ struct Hypothesis {
 
 fn solve(
     params: &SingleParams,
-    scene: &Scene<'_>,
+    (scene, ground): (&Scene<'_>, &Ground),
     photo: &QueryPhoto<'_>,
     nearest: &[NearestPoints],
     matches: &[SceneMatch],
     seed: u64,
 ) -> Option<SinglePose> {
-    let Fit { mut model, agreeing, .. } = fit(params, scene, photo, matches, seed)?;
+    let Fit { mut model, agreeing, .. } = fit(params, (scene, ground), photo, matches, seed)?;
     let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
     let depth =
         median(agreeing.iter().map(|m| (scene.index.position(m.point) - pose.translation).norm()).collect())?;
     let rest: Vec<SceneMatch> = matches.iter().copied().filter(|m| !agreeing.contains(m)).collect();
-    let runner_up = runner_up(params, scene.index, &rays, &rest, &pose, depth, seed);
+    let worth = |matches: &[SceneMatch]| matches.iter().map(|m| ground.worth(m.point)).sum::<f64>();
+    let rivals = runner_up(params, scene.index, &rays, &rest, &pose, depth, seed);
     let chance = chance_of_inlier(&rays, scene.index, &pose, &agreeing, params.max_error_sigmas);
     let seen: Vec<(Vector3<f64>, Vector3<f64>)> =
         agreeing.iter().map(|m| (pose.translation, scene.index.position(m.point))).collect();
@@ -134,7 +136,8 @@ fn solve(
         sample: SAMPLE,
         log10_false_alarms: log10_false_alarms(matches.len(), agreeing.len(), SAMPLE, chance),
         cells: occupied_cells(&rays, agreeing.iter().map(|m| m.feature)),
-        runner_up,
+        runner_up: rivals.len(),
+        runner_up_share: worth(&rivals) / worth(&agreeing),
         off_ground,
     };
     if agreeing.len() < params.verdict.min_inliers {
@@ -151,8 +154,8 @@ fn solve(
     let candidates = union(&agreeing, &guided);
     // Where nearly all matches lie on one plane, the few that were found beyond it may tell another pose nearby.
     if let Some(other) = estimate(params, scene.index, &rays, &candidates, seed ^ 0x9a1d)
-        && score(params, scene.index, &rays, &other, &candidates)
-            > score(params, scene.index, &rays, &pose, &candidates)
+        && score(params, (scene.index, ground), &rays, &other, &candidates)
+            > score(params, (scene.index, ground), &rays, &pose, &candidates)
     {
         model.photos[0].world_from_camera = other;
     }
@@ -175,7 +178,7 @@ struct Fit {
 /// Where the intrinsics are not known, a wide lens is taken for a fisheye if that explains clearly more.
 fn fit(
     params: &SingleParams,
-    scene: &Scene<'_>,
+    (scene, ground): (&Scene<'_>, &Ground),
     photo: &QueryPhoto<'_>,
     matches: &[SceneMatch],
     seed: u64,
@@ -192,11 +195,11 @@ fn fit(
         let rays = PhotoRays::new(photo.features, &model.cameras[0]);
         let pose = model.photos[0].world_from_camera;
         let agreeing = inliers(&rays, scene.index, &pose, matches, params.max_error_sigmas);
-        let score = score(params, scene.index, &rays, &pose, matches);
+        let score = score(params, (scene.index, ground), &rays, &pose, matches);
         Fit { model, agreeing, score }
     };
     let of_lens = |cameras: &[Camera], seed: u64| {
-        let best = best_hypothesis(params, scene, photo, cameras, matches, seed)?;
+        let best = best_hypothesis(params, (scene, ground), photo, cameras, matches, seed)?;
         Some(refined(best.camera, best.pose))
     };
     if photo.calibration.is_settled() {
@@ -269,7 +272,7 @@ pub(crate) fn union(first: &[SceneMatch], second: &[SceneMatch]) -> Vec<SceneMat
 /// known from covisible parts of them, too.
 fn best_hypothesis(
     params: &SingleParams,
-    scene: &Scene<'_>,
+    (scene, ground): (&Scene<'_>, &Ground),
     photo: &QueryPhoto<'_>,
     cameras: &[Camera],
     matches: &[SceneMatch],
@@ -279,13 +282,20 @@ fn best_hypothesis(
     if photo.calibration.is_settled() {
         subsets.extend(covisible_subsets(scene.index, matches, params.covisible_images));
     }
+    // Where the ground repeats itself, what agrees best in a part is a pose aside.
+    let standing = subsets
+        .iter()
+        .map(|subset| subset.iter().copied().filter(|m| !ground.holds(m.point)).collect::<Vec<SceneMatch>>());
+    let standing: Vec<_> =
+        standing.zip(&subsets).filter(|(s, all)| s.len() < all.len()).map(|(s, _)| s).collect();
+    subsets.extend(standing);
     let mut best: Option<Hypothesis> = None;
     for (number, camera) in cameras.iter().enumerate() {
         let rays = PhotoRays::new(photo.features, camera);
         for (part, subset) in subsets.iter().enumerate() {
             let seed = seed.wrapping_add((number * 64 + part) as u64);
             let Some(pose) = estimate(params, scene.index, &rays, subset, seed) else { continue };
-            let score = score(params, scene.index, &rays, &pose, matches);
+            let score = score(params, (scene.index, ground), &rays, &pose, matches);
             if best.as_ref().is_none_or(|best| score > best.score) {
                 best = Some(Hypothesis { camera: camera.clone(), pose, score });
             }
@@ -318,21 +328,22 @@ fn estimate(
     estimate_absolute_pose(&ransac, &bearings, &sigmas, &points, seed).map(|found| found.world_from_camera)
 }
 
-/// Σ 1 − min(1, (e/T)²) over the matches.
+/// Σ w (1 − min(1, (e/T)²)) over the matches, each as much as it is worth.
 fn score(
     params: &SingleParams,
-    index: &SceneIndex,
+    (index, ground): (&SceneIndex, &Ground),
     rays: &PhotoRays<'_>,
     pose: &Rigid,
     matches: &[SceneMatch],
 ) -> f64 {
     let gain = |&m: &SceneMatch| {
-        1.0 - (rays.error_sigmas(index, pose, m) / params.max_error_sigmas).min(1.0).powi(2)
+        let error = (rays.error_sigmas(index, pose, m) / params.max_error_sigmas).min(1.0);
+        ground.worth(m.point) * (1.0 - error.powi(2))
     };
     matches.iter().map(gain).sum()
 }
 
-/// Support of the best pose that the remaining matches give, when it is another pose.
+/// What supports the best pose that the remaining matches give, when it is another pose.
 fn runner_up(
     params: &SingleParams,
     index: &SceneIndex,
@@ -341,12 +352,12 @@ fn runner_up(
     best: &Rigid,
     depth: f64,
     seed: u64,
-) -> usize {
+) -> Vec<SceneMatch> {
     match estimate(params, index, rays, rest, seed ^ 0x5eed) {
         Some(pose) if !same_pose(&pose, best, depth) => {
-            inliers(rays, index, &pose, rest, params.max_error_sigmas).len()
+            inliers(rays, index, &pose, rest, params.max_error_sigmas)
         }
-        _ => 0,
+        _ => Vec::new(),
     }
 }
 

@@ -2,7 +2,7 @@ use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Calibration, Camera, ImageFeatures};
 use setloc_index::{NearestPoints, SceneIndex};
-use setloc_sfm::{ImageId, PairGeometry, PointId, Reconstruction, Rigid, Similarity};
+use setloc_sfm::{ImageId, OutvotedPair, PairGeometry, PointId, Reconstruction, Rigid, Similarity};
 
 use crate::PathToScene;
 
@@ -52,11 +52,13 @@ pub struct LocalModels<'a> {
     pub components: &'a [Reconstruction],
     /// Verified pairs of photos that no component holds both of: nothing tells how far these stand apart.
     pub open: &'a [PairGeometry],
+    /// Verified pairs of photos that weigh against what holds each component together between them; none where it ends.
+    pub outvoted: &'a [Vec<OutvotedPair>],
 }
 
 impl<'a> From<&'a [Reconstruction]> for LocalModels<'a> {
     fn from(components: &'a [Reconstruction]) -> Self {
-        Self { components, open: &[] }
+        Self { components, open: &[], outvoted: &[] }
     }
 }
 

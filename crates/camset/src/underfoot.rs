@@ -1,7 +1,7 @@
 //! Whether what supports a pose lies on the ground alone.
 
 use nalgebra::Vector3;
-use setloc_sfm::Rigid;
+use setloc_sfm::{PointId, Rigid};
 
 use crate::Scene;
 use crate::evidence::median;
@@ -43,7 +43,7 @@ impl Underfoot {
             return seen.len();
         };
         let is_elsewhere = |((center, point), below): &(&(Vector3<f64>, Vector3<f64>), f64)| {
-            !((below - height).abs() <= ROUGHNESS * height + SLOPE * (point - center).norm())
+            !is_level(*below, height, (point - center).norm())
         };
         seen.iter().zip(below).filter(is_elsewhere).count()
     }
@@ -52,6 +52,92 @@ impl Underfoot {
     pub(crate) fn is_below_horizon(&self, world_from_camera: &Rigid, bearing: &Vector3<f64>) -> bool {
         (world_from_camera.rotation * bearing).dot(&self.down) > BELOW_HORIZON
     }
+}
+
+/// Whether what lies so far below a camera, at a distance, may be on the ground.
+fn is_level(below: f64, height: f64, distance: f64) -> bool {
+    (below - height).abs() <= ROUGHNESS * height + SLOPE * distance
+}
+
+/// Rays this far below the horizon, as the sine of the angle, see the ground as a rule: what shows its height.
+const STEEP: f64 = 0.3;
+/// Points of steep rays that show an image's height above the ground where they agree,
+const MIN_STEEP: usize = 20;
+/// and the share of all of them that do.
+const MIN_AGREEING: f64 = 0.5;
+/// What a match to the ground counts beside one to what stands on it.
+const GROUND_WORTH: f64 = 0.25;
+
+/// Which points of a scene lie on the ground.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(crate) struct Ground {
+    /// By the point; beyond its end they do not.
+    is_ground: Vec<bool>,
+}
+
+impl Ground {
+    /// By how far below the images of the scene the points lie: each image's height is where most of what it sees steeply
+    /// below itself is.
+    ///
+    /// No point does where images do not stand upright.
+    pub(crate) fn of_scene(scene: &Scene<'_>) -> Self {
+        let Some(Underfoot { down }) = Underfoot::of_scene(scene) else { return Self::default() };
+        let index = scene.index;
+        let ids = || (0..index.point_count() as u32).map(PointId);
+        let seen_from = |point: PointId| {
+            index.rows_of(point).iter().filter_map(move |&row| {
+                let image = index.row(row).image;
+                let offset = index.position(point) - index.center(image)?;
+                Some((image, offset.dot(&down), offset.norm()))
+            })
+        };
+        let mut steep: Vec<Vec<f64>> = vec![Vec::new(); scene.reconstruction.images.len()];
+        for (image, below, distance) in ids().flat_map(seen_from) {
+            if below > STEEP * distance
+                && let Some(seen) = steep.get_mut(image.index())
+            {
+                seen.push(below);
+            }
+        }
+        let heights: Vec<Option<f64>> = steep.into_iter().map(height_above_ground).collect();
+        let is_ground = |point: PointId| {
+            seen_from(point).any(|(image, below, distance)| {
+                let height = heights.get(image.index()).copied().flatten();
+                height.is_some_and(|height| is_level(below, height, distance))
+            })
+        };
+        Self { is_ground: ids().map(is_ground).collect() }
+    }
+
+    /// What a match to a point counts towards a pose.
+    ///
+    /// Paving and tiles repeat themselves as nothing else does, so a pose aside can have more of them than the right one.
+    pub(crate) fn worth(&self, point: PointId) -> f64 {
+        if self.holds(point) { GROUND_WORTH } else { 1.0 }
+    }
+
+    /// Whether a point lies on the ground.
+    pub(crate) fn holds(&self, point: PointId) -> bool {
+        self.is_ground.get(point.index()) == Some(&true)
+    }
+}
+
+/// Where most of these are that an image has steeply below itself, if that is where they mostly are.
+fn height_above_ground(mut below: Vec<f64>) -> Option<f64> {
+    below.sort_by(f64::total_cmp);
+    let mut first = 0;
+    let mut most: Option<(usize, f64)> = None;
+    for last in 0..below.len() {
+        while below[first] * (1.0 + ROUGHNESS) < below[last] {
+            first += 1;
+        }
+        let count = last + 1 - first;
+        if most.is_none_or(|(least, _)| count > least) {
+            most = Some((count, below[usize::midpoint(first, last)]));
+        }
+    }
+    let (count, height) = most?;
+    (count >= MIN_STEEP && count as f64 >= MIN_AGREEING * below.len() as f64).then_some(height)
 }
 
 #[cfg(test)]
@@ -64,6 +150,33 @@ mod tests {
         let center = Vector3::new(0.0, 0.0, height);
         let seen: Vec<_> = points.iter().map(|&point| (center, Vector3::from(point))).collect();
         DOWN.count_elsewhere(&seen)
+    }
+
+    #[test]
+    fn the_height_above_the_ground_is_where_most_of_what_is_seen_steeply_below_lies() {
+        let ground = (0..30).map(|at| 2.0 + 0.005 * f64::from(at));
+        let low_walls = (0..20).map(|at| 0.5 + 0.05 * f64::from(at));
+        let height = height_above_ground(ground.clone().chain(low_walls).collect()).expect("is seen");
+        assert!((2.0..2.2).contains(&height), "{height}");
+        // Steps, slopes or too few points show none.
+        assert_eq!(height_above_ground((1..60).map(f64::from).collect()), None);
+        assert_eq!(height_above_ground(ground.take(15).collect()), None);
+        assert_eq!(height_above_ground(Vec::new()), None);
+    }
+
+    #[test]
+    fn points_of_a_scene_are_on_the_ground_where_its_images_stand_that_far_above() {
+        let world = crate::synthetic::World::chain(3, 0.2, 4);
+        let scene = world.scene();
+        let ground = Ground::of_scene(&scene);
+        let ids = (0..scene.index.point_count() as u32).map(PointId);
+        let on_ground: Vec<PointId> = ids.filter(|point| ground.holds(*point)).collect();
+        assert!(!on_ground.is_empty());
+        for point in &on_ground {
+            assert_eq!(ground.worth(*point), GROUND_WORTH);
+        }
+        assert!(on_ground.len() < scene.index.point_count() / 2, "{}", on_ground.len());
+        assert_eq!(Ground::default().worth(PointId(7)), 1.0);
     }
 
     #[test]

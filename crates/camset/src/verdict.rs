@@ -19,6 +19,8 @@ pub(crate) struct Evidence {
     pub cells: usize,
     /// Support of the best pose that is distinct from this one.
     pub runner_up: usize,
+    /// What that is worth as a share of what supports this one: the ground counts for less.
+    pub runner_up_share: f64,
     /// How many of the inliers lie elsewhere than on the ground.
     pub off_ground: usize,
 }
@@ -32,7 +34,9 @@ pub(crate) fn judge_support(
     evidence: &Evidence,
     reasons: &mut Vec<String>,
 ) -> Verdict {
-    let Evidence { matches, inliers, log10_false_alarms, cells, runner_up, off_ground, .. } = *evidence;
+    let Evidence {
+        matches, inliers, log10_false_alarms, cells, runner_up, runner_up_share, off_ground, ..
+    } = *evidence;
     reasons.push(format!("{inliers} of {matches} matches to the scene agree on the pose"));
     if inliers < params.min_inliers {
         reasons.push(format!("a pose needs at least {} agreeing matches", params.min_inliers));
@@ -51,7 +55,7 @@ pub(crate) fn judge_support(
     if cells < params.min_cells {
         doubt(format!("the agreeing matches lie in {cells} of 64 parts of the image only"));
     }
-    if runner_up as f64 > params.max_runner_up * inliers as f64 && runner_up >= params.min_inliers / 2 {
+    if !(runner_up_share <= params.max_runner_up) && runner_up >= params.min_inliers / 2 {
         doubt(format!("another pose is supported by {runner_up} matches (repeated structure?)"));
     }
     if off_ground < MIN_OFF_GROUND {
@@ -121,6 +125,7 @@ mod tests {
             log10_false_alarms: -60.0,
             cells: 20,
             runner_up: 4,
+            runner_up_share: 0.1,
             off_ground: 30,
         }
     }
@@ -136,7 +141,7 @@ mod tests {
         assert_eq!(judge(&Evidence { log10_false_alarms: -1.0, ..good() }), Verdict::Uncertain);
         assert_eq!(judge(&Evidence { log10_false_alarms: f64::NAN, ..good() }), Verdict::Uncertain);
         assert_eq!(judge(&Evidence { cells: 2, ..good() }), Verdict::Uncertain);
-        assert_eq!(judge(&Evidence { runner_up: 30, ..good() }), Verdict::Uncertain);
+        assert_eq!(judge(&Evidence { runner_up: 30, runner_up_share: 0.75, ..good() }), Verdict::Uncertain);
         assert_eq!(judge(&Evidence { off_ground: 3, ..good() }), Verdict::Uncertain);
     }
 

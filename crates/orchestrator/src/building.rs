@@ -115,6 +115,8 @@ pub fn has_guessed_cameras(images: &[SourceImage]) -> bool {
 /// The images with the cameras that a first model tells in place of guessed ones, `None` when it tells none, and what that
 /// model took.
 ///
+/// Where images seem not to share a guess, a second model with what the first tells shows whether they do.
+///
 /// # Errors
 /// When the run was stopped or the store cannot be written.
 pub fn estimate_cameras(
@@ -130,9 +132,22 @@ pub fn estimate_cameras(
     }
     let mut graph = JobGraph::default();
     let jobs = add_first_model(&mut graph, images, alike, config, seed)?;
+    let (told, doubtful, first) = session.run(name, &graph, |executor, run| {
+        let model = executor.load_made::<MapperOutput>(jobs.model)?;
+        let doubtful = model.as_ref().is_some_and(|model| !model.report.doubtful.is_empty());
+        let told = model.and_then(|model| with_estimated_cameras(images, &jobs, &model));
+        Ok((told, doubtful, run.clone()))
+    })?;
+    let told = match told {
+        Some(told) if doubtful => told,
+        told => return Ok((told, first)),
+    };
+    let mut graph = JobGraph::default();
+    let jobs = add_first_model(&mut graph, &told, alike, config, seed)?;
     session.run(name, &graph, |executor, run| {
         let model = executor.load_made::<MapperOutput>(jobs.model)?;
-        Ok((model.and_then(|model| with_estimated_cameras(images, &jobs, &model)), run.clone()))
+        let better = model.and_then(|model| with_estimated_cameras(&told, &jobs, &model));
+        Ok((Some(better.unwrap_or(told)), first.and(run.clone())))
     })
 }
 
@@ -141,28 +156,32 @@ const MIN_IMAGES: usize = 3;
 
 /// The images with the cameras of a model in place of guessed ones; `None` when it tells none.
 ///
-/// Images of one guess have one camera: that of the component that has registered most of them.
+/// Images of one guess have one camera: that of the component that has registered most of them. Where they have several
+/// there, each registered image has its own, and the others keep the guess.
 fn with_estimated_cameras(
     images: &[SourceImage],
     jobs: &SceneModelJobs,
     model: &MapperOutput,
 ) -> Option<Vec<SourceImage>> {
-    let registered = |component: &Reconstruction, guess: &Camera| -> Vec<ImageId> {
-        let is_of_guess = |id: &ImageId| {
-            let given = jobs.image_given(&component.images[id.index()]).and_then(|at| images.get(at));
-            given.is_some_and(|image| image.is_guess(guess))
-        };
-        component.registered().filter(is_of_guess).collect()
+    let registered = |component: &Reconstruction, guess: &Camera| -> Vec<(usize, ImageId)> {
+        let given = |id: ImageId| Some((jobs.image_given(&component.images[id.index()])?, id));
+        let is_of_guess = |(at, _): &(usize, ImageId)| images.get(*at).is_some_and(|i| i.is_guess(guess));
+        component.registered().filter_map(given).filter(is_of_guess).collect()
     };
-    let is_told = |component: &Reconstruction, images: &[ImageId]| {
-        images.len() >= MIN_IMAGES || component.tells_camera_of(images)
-    };
-    let told = |guess: &Camera| {
+    let told = |at: usize| {
+        let guess = &images[at].camera;
         // Of equal numbers the last counts most: that of the larger component.
         let found = model.components.iter().rev().map(|component| (component, registered(component, guess)));
-        let (component, images) = found.max_by_key(|(_, images)| images.len())?;
-        let first = images.first().filter(|_| is_told(component, &images))?;
-        Some((component.camera_of(*first).clone(), Calibration::Guessed))
+        let (component, alike) = found.max_by_key(|(_, alike)| alike.len())?;
+        let camera_of = |id: ImageId| component.images[id.index()].camera;
+        let &(_, first) = alike.first()?;
+        let have_one = alike.iter().all(|(_, id)| camera_of(*id) == camera_of(first));
+        let shown_by =
+            if have_one { first } else { alike.iter().find(|(given, _)| *given == at).map(|(_, id)| *id)? };
+        let sharing: Vec<ImageId> =
+            alike.iter().map(|(_, id)| *id).filter(|id| camera_of(*id) == camera_of(shown_by)).collect();
+        let is_told = sharing.len() >= MIN_IMAGES || component.tells_camera_of(&sharing);
+        is_told.then(|| (component.camera_of(shown_by).clone(), Calibration::Guessed))
     };
     with_told_cameras(images, told)
 }

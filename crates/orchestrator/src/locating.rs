@@ -13,7 +13,9 @@ use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, RunResult};
-use crate::jobs::{LocateJobs, LocatedJobs, add_features_of, add_grown, add_set, add_singles};
+use crate::jobs::{
+    LocateJobs, LocatedJobs, add_features_of, add_grown, add_set, add_singles, divided_guesses,
+};
 use crate::scene::SceneFile;
 use crate::session::Session;
 
@@ -45,6 +47,8 @@ pub struct Located {
     pub skipped: Vec<SkippedImage>,
     /// What is odd about the photos.
     pub warnings: Vec<String>,
+    /// Which photos were given one camera with others that, by the local model, seem not to have the same.
+    pub divided: Vec<bool>,
 }
 
 impl Located {
@@ -108,19 +112,26 @@ pub fn locate(
         located.single.iter().any(|photo| photo.name == target && photo.verdict == Verdict::Localized);
     let wanted = matches!(mode, Mode::Set | Mode::Both) || (mode == Mode::Auto && !found);
     if wanted {
-        if folder.images.iter().any(|image| is_lone_guess(&folder.images, image)) {
+        let lone: Vec<bool> =
+            folder.images.iter().map(|image| is_lone_guess(&folder.images, image)).collect();
+        if lone.contains(&true) {
             if located.single.is_empty() {
                 whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);
             }
-            improve_lone_guesses(&mut folder.images, &located.single);
-            whole.absorb(improve_by_model(session, &mut folder.images, what, name)?);
+            improve_guesses(&mut folder.images, &lone, &located.single);
+            whole.absorb(improve_by_model(session, &mut folder.images, &lone, what, name)?);
             if mode == Mode::Set {
                 located.single.clear();
             }
         }
         let alone = mode == Mode::Both && located.single.is_empty();
         whole.absorb(run(session, folder, what, (name, target), (alone, true), &mut located)?);
-        let images = with_estimated_cameras(&folder.images, located.set.as_ref());
+        if located.divided.contains(&true) {
+            let divided = located.divided.clone();
+            whole.absorb(improve_by_model(session, &mut folder.images, &divided, what, name)?);
+            whole.absorb(run(session, folder, what, (name, target), (false, true), &mut located)?);
+        }
+        let images = with_estimated_cameras(&folder.images, &located.divided, located.set.as_ref());
         if let Some(images) = images {
             let calibrated = ImageFolder { images, ..folder.clone() };
             let mut again = Located { set: None, local_models: Vec::new(), ..located.clone() };
@@ -144,13 +155,13 @@ fn is_lone_guess(images: &[SourceImage], image: &SourceImage) -> bool {
     image.calibration == Calibration::Guessed && alike < MIN_PHOTOS
 }
 
-/// Puts what photos that are localized alone tell of their cameras in place of guesses that few photos share.
+/// Puts what photos that are localized alone tell of their cameras in place of guesses; meant for those that few photos
+/// share.
 ///
 /// Such a camera has but what its own photos show to be estimated from, and along a street photos among themselves tell
 /// focal lengths poorly: a longer one and a step ahead look much the same.
-fn improve_lone_guesses(images: &mut [SourceImage], alone: &[PhotoLocalization]) {
-    let is_lone: Vec<bool> = images.iter().map(|image| is_lone_guess(images, image)).collect();
-    for (image, _) in images.iter_mut().zip(is_lone).filter(|(_, is_lone)| *is_lone) {
+fn improve_guesses(images: &mut [SourceImage], which: &[bool], alone: &[PhotoLocalization]) {
+    for (image, _) in images.iter_mut().zip(which).filter(|(_, is_meant)| **is_meant) {
         let tells =
             |photo: &&PhotoLocalization| photo.verdict == Verdict::Localized && photo.name == image.name;
         if let Some(photo) = alone.iter().find(tells) {
@@ -159,21 +170,22 @@ fn improve_lone_guesses(images: &mut [SourceImage], alone: &[PhotoLocalization])
     }
 }
 
-/// Puts the cameras of a first model of the photos, as scenes have one, in place of guesses that few photos share.
+/// Puts the cameras of a first model of the photos, as scenes have one, in place of guesses; meant for those that few photos
+/// share, or photos of several cameras.
 ///
 /// A guess is a third too long or more, and pairs that are verified with it lose what lies off one wall.
 fn improve_by_model(
     session: &Session,
     images: &mut [SourceImage],
+    which: &[bool],
     what: &LocateJobs,
     name: &str,
 ) -> Result<RunResult> {
-    let is_lone: Vec<bool> = images.iter().map(|image| is_lone_guess(images, image)).collect();
     let config = Config { features: what.config.photo_features(), ..what.config.clone() };
     let (alike, before) = alike_pairs(session, name, images, &config.features, &config)?;
     let (told, run) = estimate_cameras(session, name, images, &alike, &config, what.seed)?;
     let told = told.into_iter().flatten();
-    for ((image, told), _) in images.iter_mut().zip(told).zip(is_lone).filter(|(_, is_lone)| *is_lone) {
+    for ((image, told), _) in images.iter_mut().zip(told).zip(which).filter(|(_, is_meant)| **is_meant) {
         image.camera = told.camera;
     }
     Ok(before.and(run))
@@ -184,11 +196,20 @@ fn improve_by_model(
 /// Photos of one guess have one camera: that of the component in which most scene points place localized photos of
 /// theirs, else photos whose pose is uncertain. One that few photos tell replaces the guess and is a guess itself: what
 /// the local model shows of it counts as well. So is that of a wide lens, which may turn out to be a fisheye.
-fn with_estimated_cameras(images: &[SourceImage], set: Option<&SetLocalization>) -> Option<Vec<SourceImage>> {
+///
+/// Photos that the local model divides have the one that they show themselves.
+fn with_estimated_cameras(
+    images: &[SourceImage],
+    divided: &[bool],
+    set: Option<&SetLocalization>,
+) -> Option<Vec<SourceImage>> {
     let placed: BTreeMap<&str, &PhotoLocalization> = set?.refined.iter().map(|p| (&*p.name, p)).collect();
-    let told = |guess: &Camera| {
+    let told = |at: usize| {
+        let guess = &images[at].camera;
         let mut support: Vec<(&Camera, [usize; 2], usize)> = Vec::new();
-        let alike = images.iter().filter(|image| image.is_guess(guess));
+        let alone = (divided.get(at) == Some(&true)).then_some(at);
+        let alike = images.iter().enumerate().filter(|(other, _)| alone.is_none_or(|at| at == *other));
+        let alike = alike.map(|(_, image)| image).filter(|image| image.is_guess(guess));
         for photo in alike.filter_map(|image| placed.get(&*image.name)) {
             let [localized, uncertain] = match photo.verdict {
                 Verdict::Localized => [photo.inliers, 0],
@@ -247,6 +268,7 @@ fn run(
             located.set = Some((*executor.load::<SetLocalization>(set.set)?).clone());
             let model = executor.load::<MapperOutput>(set.model.model)?;
             located.local_models = model.components.iter().map(|c| c.registered().count()).collect();
+            located.divided = divided_guesses(&folder.images, &model);
         }
         Ok(before.and(result.clone()))
     })
@@ -353,14 +375,8 @@ mod tests {
         let guess = Camera::from_focal_guess(1600, 1200, 1920.0);
         let known = Camera::from_focal_guess(1600, 1200, 1111.0);
         let image = |name: &str, camera: &Camera, calibration| SourceImage {
-            name: name.to_owned(),
-            path: std::path::PathBuf::new(),
-            hash: ContentHash::of(name.as_bytes()),
-            camera: camera.clone(),
             calibration,
-            camera_origin: CameraOrigin::Listed,
-            position: None,
-            mask: None,
+            ..SourceImage::guessed(name, camera.clone())
         };
         let guessed = |name: &str| image(name, &guess, Calibration::Guessed);
         let images =
@@ -378,7 +394,7 @@ mod tests {
         };
         let told = |refined: Vec<PhotoLocalization>| {
             let set = SetLocalization { refined, ..SetLocalization::default() };
-            let images = with_estimated_cameras(&images, Some(&set))?;
+            let images = with_estimated_cameras(&images, &[], Some(&set))?;
             assert_eq!((&images[4].camera, images[4].calibration), (&known, Calibration::Known));
             let same = |image: &SourceImage| {
                 (&image.camera, image.calibration) == (&images[0].camera, images[0].calibration)
@@ -401,20 +417,24 @@ mod tests {
         assert_eq!(told(uncertain), Some((1500.0, Calibration::Guessed)));
         assert_eq!(told(vec![photo("a", 1500.0, 0, NotLocalized)]), None);
         assert_eq!(told(vec![photo("k", 1111.0, 99, Localized)]), None);
-        assert!(with_estimated_cameras(&images, None).is_none());
+        assert!(with_estimated_cameras(&images, &[], None).is_none());
+        // Photos that do not share the guess have what each shows.
+        let refined = vec![
+            photo("a", 1500.0, 60, Localized),
+            photo("b", 1200.0, 50, Localized),
+            photo("c", 1200.0, 20, Localized),
+        ];
+        let set = SetLocalization { refined, ..SetLocalization::default() };
+        let told = with_estimated_cameras(&images, &[true; 5], Some(&set)).expect("three are told");
+        let focal: Vec<f64> = told.iter().map(|image| image.camera.focal_length()).collect();
+        assert_eq!(focal, [1500.0, 1200.0, 1200.0, 1920.0, 1111.0]);
+        assert!(told[..3].iter().all(|image| image.calibration == Calibration::Guessed));
     }
 
     #[test]
     fn what_a_photo_alone_tells_of_its_camera_replaces_a_guess_that_few_share() {
-        let image = |name: &str, width: u32| SourceImage {
-            name: name.to_owned(),
-            path: std::path::PathBuf::new(),
-            hash: ContentHash::of(name.as_bytes()),
-            camera: Camera::from_focal_guess(width, 1200, 1.2 * f64::from(width)),
-            calibration: Calibration::Guessed,
-            camera_origin: CameraOrigin::Listed,
-            position: None,
-            mask: None,
+        let image = |name: &str, width: u32| {
+            SourceImage::guessed(name, Camera::from_focal_guess(width, 1200, 1.2 * f64::from(width)))
         };
         let photo = |name: &str, width: u32, verdict| PhotoLocalization {
             name: name.to_owned(),
@@ -434,7 +454,9 @@ mod tests {
             photo("d", 1280, Verdict::Localized),
             photo("e", 1920, Verdict::Uncertain),
         ];
-        improve_lone_guesses(&mut images, &alone);
+        let lone: Vec<bool> = images.iter().map(|image| is_lone_guess(&images, image)).collect();
+        assert_eq!(lone, [false, false, false, true, true]);
+        improve_guesses(&mut images, &lone, &alone);
         let focal: Vec<f64> = images.iter().map(|image| image.camera.focal_length()).collect();
         assert_eq!(focal, [1920.0, 1920.0, 1920.0, 1000.0, 2304.0]);
         assert!(are_untold(&images));

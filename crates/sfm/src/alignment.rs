@@ -34,7 +34,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 17;
+pub const ALIGNMENT_VERSION: u32 = 18;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;
@@ -108,8 +108,9 @@ pub struct AlignmentReport {
 
 /// Aligns the tracks of a component and adjusts it.
 ///
-/// `features` are those of the component's images, by id; `camera_fixed` says whose intrinsics are known. `load` gives
-/// the pixels of a registered image and may be called five times for each, from several threads.
+/// `features` are those of the component's images, by id; `camera_fixed` says whose intrinsics are known, and those of
+/// cameras beyond its end, which the mapper added, are not. `load` gives the pixels of a registered image and may be called
+/// five times for each, from several threads.
 ///
 /// In a component in which photos share a standpoint nothing moves, as what ties their centres together is not known
 /// here: its points get their places only.
@@ -487,7 +488,7 @@ impl<'a> Tracks<'a> {
         }
         for (camera, freedom) in problem.camera_freedom.iter_mut().enumerate() {
             let is_told = || users[camera].len() >= 2 || component.tells_camera_of(&users[camera]);
-            if camera_fixed.get(camera) == Some(&false) && is_told() {
+            if camera_fixed.get(camera) != Some(&true) && is_told() {
                 *freedom = IntrinsicsFreedom::FREE;
                 let usual = CameraPrior::of_usual_photo(camera as u32, &component.cameras[camera]);
                 problem.camera_priors.extend(usual);

@@ -27,7 +27,9 @@ pub use mapper::{
     InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,
     MergeVerdict, Mosaic, PutativePair, RegistrationRecord, reconstruct,
 };
-pub use quality::{PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess};
+pub use quality::{
+    OutvotedPair, PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess,
+};
 pub use reconstruction::{
     AlignedTrack, BaselineLength, CameraId, ImageId, Observation, Place, PointId, Reconstruction,
     ReconstructionImage, ReconstructionPoint, StepPose,

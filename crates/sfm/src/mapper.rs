@@ -7,6 +7,7 @@ pub(crate) mod continuation;
 mod corner;
 mod correspondence;
 mod direction;
+mod divide;
 mod initial;
 mod lens;
 mod merge;
@@ -29,7 +30,7 @@ use std::{cmp::Reverse, collections::BTreeMap};
 use nalgebra::{UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use setloc_features::{Camera, ImageFeatures, Match};
+use setloc_features::{Calibration, Camera, ImageFeatures, Match};
 
 pub(crate) use self::adjust::{MIN_ADJUSTABLE_POINTS, MIN_CALIBRATING_POINTS};
 pub(crate) use self::corner::ln_false_alarms;
@@ -44,6 +45,7 @@ use self::{
     calibration::calibrate,
     continuation::{Continued, continue_planes},
     correspondence::CorrespondenceGraph,
+    divide::divide,
     lens::choose_lenses,
     model::Model,
     projection::search_by_projection,
@@ -57,14 +59,14 @@ use self::{
     witnesses::{Testimony, Witnesses},
 };
 use crate::{
-    BaselineLength, CameraId, Georegistration, ImageId, Observation, PairGeometry, PointId, Reconstruction,
-    Rigid, TwoViewKind, TwoViewParams,
+    BaselineLength, CameraId, Georegistration, ImageId, Observation, OutvotedPair, PairGeometry, PointId,
+    Reconstruction, Rigid, TwoViewKind, TwoViewParams,
     bundle::{BundleParams, RobustLoss},
     robust::RansacParams,
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 32;
+pub const MAPPER_VERSION: u32 = 34;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -195,8 +197,8 @@ impl<'a> InputImage<'a> {
 pub struct MapperInput<'a> {
     /// Cameras, shared by images.
     pub cameras: Vec<Camera>,
-    /// Whether the intrinsics of each camera are known and stay fixed.
-    pub camera_fixed: Vec<bool>,
+    /// How well each camera is known; all but guesses stay fixed.
+    pub calibrations: Vec<Calibration>,
     /// All images; ids are indices.
     pub images: Vec<InputImage<'a>>,
     /// Verified pairs.
@@ -205,6 +207,13 @@ pub struct MapperInput<'a> {
     pub putative: &'a [PutativePair],
     /// How pairs of mosaics are verified.
     pub two_view: TwoViewParams,
+}
+
+impl MapperInput<'_> {
+    /// Whether the intrinsics of a camera stay as they are.
+    pub(crate) fn is_fixed(&self, camera: usize) -> bool {
+        self.calibrations[camera].is_settled()
+    }
 }
 
 /// All matches of two images, before verification.
@@ -265,15 +274,22 @@ pub struct MapperReport {
     pub georegistrations: Vec<Option<Georegistration>>,
     /// Things that disagree, in words.
     pub warnings: Vec<String>,
+    /// Guessed cameras that the images that were given each seem not to share.
+    pub doubtful: Vec<CameraId>,
 }
 
 /// Components, largest first, and the report.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct MapperOutput {
     /// Connected components, largest first.
+    ///
+    /// Where images cannot share the camera that they were given as one, those at the end of the list of cameras are of
+    /// some of them.
     pub components: Vec<Reconstruction>,
     /// Verified pairs of images that no component holds both of.
     pub open_pairs: Vec<PairGeometry>,
+    /// Pairs that weigh against what holds each component together there; none is known of components beyond the end.
+    pub outvoted: Vec<Vec<OutvotedPair>>,
     /// What happened.
     pub report: MapperReport,
 }
@@ -308,7 +324,37 @@ impl MapperOutput {
 ///
 /// Images that share no geometry with others are in no component. The frame of a component is its first camera's,
 /// with the first baseline as unit of length, until it is georegistered.
+///
+/// Where images turn out not to share the camera that they were given as one, they are mapped again with several, unless it is
+/// known or a bare guess: see [`MapperOutput::components`] and [`MapperReport::doubtful`].
 pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
+    let mut output = reconstruct_with(params, input, seed);
+    let mut used = input.clone();
+    for _ in 0..MAX_DIVISIONS {
+        let Some(largest) = output.components.first() else { break };
+        let division = divide(params, input, &used, largest);
+        output.report.doubtful = division.doubtful;
+        let Some(divided) = division.input else { break };
+        let mut again = reconstruct_with(params, &divided, seed);
+        let size = |output: &MapperOutput| {
+            output.components.first().map_or(0, |component| component.registered().count())
+        };
+        if (size(&again) as f64) < MIN_KEPT * size(&output) as f64 {
+            break;
+        }
+        again.report.doubtful.clone_from(&output.report.doubtful);
+        (output, used) = (again, divided);
+    }
+    output
+}
+
+/// How often images are mapped again with other cameras.
+const MAX_DIVISIONS: usize = 2;
+/// Share of the images of the largest component that has to be left with these.
+const MIN_KEPT: f64 = 0.75;
+
+/// The same with cameras shared as they are given.
+fn reconstruct_with(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
     if let Some(standpoints) = Standpoints::find(params, input, seed) {
         return standpoints.expand(reconstruct_images(params, &standpoints.input(), seed));
     }
@@ -403,7 +449,7 @@ fn finished(
     let size = |component: &Reconstruction| component.registered().count();
     components.retain(|component| size(component) >= 2);
     components.sort_by_key(|component| Reverse(size(component)));
-    MapperOutput { components, open_pairs: Vec::new(), report }
+    MapperOutput { components, report, ..MapperOutput::default() }
 }
 
 /// The part with further observations of its points, where images have few.
@@ -752,7 +798,7 @@ impl<'a> Mapper<'a> {
     /// waits for points instead gets a camera with them.
     fn knows_camera_of(&self, image: ImageId) -> bool {
         let camera = self.model.input.images[image.index()].camera.index();
-        self.model.input.camera_fixed[camera]
+        self.model.input.is_fixed(camera)
             || !self.model.cameras[camera].is_bare_guess()
             || !self.model.registered_with(camera).is_empty()
     }
@@ -760,7 +806,8 @@ impl<'a> Mapper<'a> {
     /// Finds the intrinsics of unknown cameras that no registered image has, where a waiting image tells them.
     fn calibrate_waiting(&mut self) {
         let camera_of = |image: ImageId| self.model.input.images[image.index()].camera.index();
-        let mut is_settled = self.model.input.camera_fixed.clone();
+        let mut is_settled: Vec<bool> =
+            self.model.input.calibrations.iter().map(|calibration| calibration.is_settled()).collect();
         self.model.registered().for_each(|image| is_settled[camera_of(image)] = true);
         if !is_settled.contains(&false) {
             return;

@@ -1,6 +1,6 @@
 //! The quality gate: what in a finished model disagrees with its own evidence.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -55,9 +55,37 @@ pub struct PairDisagreement {
 }
 
 impl PairDisagreement {
+    /// Whether so many matches cannot be what the model has that they speak against it by themselves.
+    fn is_heavy(&self) -> bool {
+        self.matches >= HEAVY_MATCHES && (self.is_unused() || self.rotation_deg > HEAVY_ROTATION_DEG)
+    }
+
     /// Whether next to nothing of what the pair shares became points of the model.
     fn is_unused(&self) -> bool {
         self.used * 5 < self.matches
+    }
+}
+
+/// A verified pair that a model contradicts though it has about as many matches as the model has points where these hold its
+/// two images together: it may well be the model that is wrong there.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OutvotedPair {
+    /// First image.
+    pub first: ImageId,
+    /// Second image.
+    pub second: ImageId,
+    /// Verified matches of the pair.
+    pub matches: usize,
+    /// Points of the weakest link between the two, on the way of the strongest links.
+    pub held_by: usize,
+    /// The images that are with the first when that link is cut, ascending.
+    pub side: Vec<ImageId>,
+}
+
+impl OutvotedPair {
+    /// Matches for each point that holds the model together there.
+    pub fn weight(&self) -> f64 {
+        self.matches as f64 / self.held_by.max(1) as f64
     }
 }
 
@@ -85,6 +113,8 @@ pub struct QualityReport {
     pub pairs: usize,
     /// Pairs that the model contradicts; expected where façades repeat, as long as they are few.
     pub disagreements: Vec<PairDisagreement>,
+    /// Those of them that weigh more than what holds the model together there.
+    pub outvoted: Vec<OutvotedPair>,
     /// Signs of a fold.
     pub suspicious: Vec<SuspiciousNeighbours>,
     /// Registered images with few points.
@@ -166,6 +196,8 @@ pub fn assess(
     let points_of = sum(|counts| &counts.points_of, n);
     // Of the geometries of one pair the model can have one only.
     let mut judged: BTreeMap<(ImageId, ImageId), (PairDisagreement, bool)> = BTreeMap::new();
+    // What photos turned on the spot share becomes no points.
+    let mut turned: BTreeSet<(ImageId, ImageId)> = BTreeSet::new();
     for pair in pairs {
         let poses = (
             reconstruction.images[pair.first.index()].world_from_camera,
@@ -186,6 +218,9 @@ pub fn assess(
         };
         let is_turned = found.rotation_deg > params.max_rotation_deg && two_view.kind == TwoViewKind::General;
         let agrees = !found.is_unused() && !is_turned;
+        if two_view.kind == TwoViewKind::PureRotation && found.rotation_deg <= params.max_rotation_deg {
+            turned.insert((pair.first, pair.second));
+        }
         let (kept, any_agrees) =
             judged.entry((pair.first, pair.second)).or_insert_with(|| (found.clone(), false));
         *any_agrees |= agrees;
@@ -196,6 +231,10 @@ pub fn assess(
     report.pairs = judged.len();
     let disagreements = judged.into_values().filter(|(_, any_agrees)| !any_agrees);
     report.disagreements = disagreements.map(|(found, _)| found).collect();
+    let links = strongest_links(n, |a, b| shared[a * n + b].max(shared[b * n + a]));
+    let is_mere_turn = |pair: &PairDisagreement| turned.contains(&(pair.first, pair.second));
+    let heavy = report.disagreements.iter().filter(|pair| pair.is_heavy() && !is_mere_turn(pair));
+    report.outvoted = heavy.filter_map(|pair| outvoted(pair, n, &links)).collect();
     for first in reconstruction.registered() {
         for second in reconstruction.registered().filter(|&second| second > first) {
             let (forth, back) = (first.index() * n + second.index(), second.index() * n + first.index());
@@ -212,6 +251,73 @@ pub fn assess(
         }
     }
     report
+}
+
+/// Fewest matches of a pair that speaks against a model by itself.
+const HEAVY_MATCHES: usize = 50;
+/// Rotation from which on none of them can be right in the model, whatever became points.
+const HEAVY_ROTATION_DEG: f64 = 30.0;
+
+/// How much a pair must weigh for that. In right models of photos those that are wrong weigh up to 0.50, against wrong
+/// ones right ones from 1.3 on.
+const MIN_WEIGHT: f64 = 0.75;
+
+/// Two images and the points that they share.
+type LinkBetween = (usize, usize, usize);
+
+/// Images in groups that grow together, each by the number of its group.
+struct Groups(Vec<usize>);
+
+impl Groups {
+    fn of_one_each(images: usize) -> Self {
+        Self((0..images).collect())
+    }
+
+    /// Makes the groups of two images one; `false` where they already are.
+    fn join(&mut self, a: usize, b: usize) -> bool {
+        let (kept, gone) = (self.0[a], self.0[b]);
+        for group in self.0.iter_mut().filter(|group| **group == gone) {
+            *group = kept;
+        }
+        kept != gone
+    }
+
+    fn are_one(&self, a: usize, b: usize) -> bool {
+        self.0[a] == self.0[b]
+    }
+}
+
+/// The links that tie all images together by the most points each: the maximum spanning forest, strongest first.
+fn strongest_links(images: usize, points: impl Fn(usize, usize) -> usize) -> Vec<LinkBetween> {
+    let pairs = (0..images).flat_map(|a| (a + 1..images).map(move |b| (a, b)));
+    let mut links: Vec<LinkBetween> = pairs.map(|(a, b)| (a, b, points(a, b))).collect();
+    links.retain(|(.., points)| *points > 0);
+    links.sort_by_key(|&(a, b, points)| (std::cmp::Reverse(points), a, b));
+    let mut tied = Groups::of_one_each(images);
+    links.retain(|&(a, b, _)| tied.join(a, b));
+    links
+}
+
+/// The pair with what holds its images together, where that is less.
+fn outvoted(pair: &PairDisagreement, images: usize, links: &[LinkBetween]) -> Option<OutvotedPair> {
+    let (first, second) = (pair.first.index(), pair.second.index());
+    // The weakest link between the two is that with which the strongest ones first tie them.
+    let mut tied = Groups::of_one_each(images);
+    let weakest = links.iter().position(|&(a, b, _)| {
+        tied.join(a, b);
+        tied.are_one(first, second)
+    })?;
+    let held_by = links[weakest].2;
+    let mut tied = Groups::of_one_each(images);
+    for (at, &(a, b, _)) in links.iter().enumerate() {
+        if at != weakest {
+            tied.join(a, b);
+        }
+    }
+    let side = (0..images).filter(|&image| tied.are_one(first, image));
+    let side = side.map(|image| ImageId(image as u32)).collect();
+    let PairDisagreement { first, second, matches, .. } = *pair;
+    Some(OutvotedPair { first, second, matches, held_by, side }).filter(|pair| pair.weight() > MIN_WEIGHT)
 }
 
 /// Matches from which on a single pair that contradicts the model is worth a word: chance does not make so many.
@@ -233,6 +339,15 @@ impl QualityReport {
                 name(pair.second),
                 pair.shared,
                 pair.expected
+            ));
+        }
+        for pair in &self.outvoted {
+            lines.push(format!(
+                "the {} matches of {} and {} contradict the model, which {} points hold together between them: it may be wrong there",
+                pair.matches,
+                name(pair.first),
+                name(pair.second),
+                pair.held_by
             ));
         }
         for (image, points) in &self.weak_images {
@@ -271,9 +386,9 @@ impl QualityReport {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{CameraId, Observation, ReconstructionImage, Rigid};
+    use crate::{CameraId, Observation, ReconstructionImage, Rigid, TwoView};
     use nalgebra::UnitQuaternion;
-    use setloc_features::{Camera, CameraModel};
+    use setloc_features::{Camera, CameraModel, Match};
 
     fn image(name: &str, x: f64) -> ReconstructionImage {
         ReconstructionImage {
@@ -315,6 +430,75 @@ mod tests {
         let turned = UnitQuaternion::from_euler_angles(0.0, std::f64::consts::PI, 0.0);
         model.images[1].world_from_camera = Some(Rigid::new(turned, Vector3::new(0.1, 0.0, 0.0)));
         assert_eq!(assess(&QualityParams::default(), &model, &[]).suspicious, []);
+    }
+
+    #[test]
+    fn a_pair_outvotes_what_holds_its_images_together_where_that_is_less() {
+        // Two chains of three, tied by few points.
+        let points = |a: usize, b: usize| match (a, b) {
+            (0, 1) | (1, 2) | (3, 4) | (4, 5) => 400,
+            (0, 2) => 90,
+            (2, 3) => 60,
+            (1, 4) => 30,
+            (0, 6) => 20,
+            _ => 0,
+        };
+        let links = strongest_links(8, points);
+        assert_eq!(links, [(0, 1, 400), (1, 2, 400), (3, 4, 400), (4, 5, 400), (2, 3, 60), (0, 6, 20)]);
+        let found = |first: u32, second: u32, matches: usize| {
+            let (first, second) = (ImageId(first), ImageId(second));
+            outvoted(&PairDisagreement { first, second, matches, used: 0, rotation_deg: 0.0 }, 8, &links)
+        };
+        let across = found(1, 5, 300).expect("weighs more");
+        assert_eq!((across.held_by, across.side), (60, [0, 1, 2, 6].map(ImageId).to_vec()));
+        assert_eq!(found(1, 5, 40), None);
+        assert_eq!(found(0, 2, 250), None);
+        // Of an image that nothing ties there is nothing to say.
+        assert_eq!(found(0, 7, 300), None);
+    }
+
+    #[test]
+    fn what_photos_turned_on_the_spot_share_speaks_against_nothing() {
+        let mut model = Reconstruction {
+            cameras: vec![Camera::equirectangular(200, 100)],
+            images: vec![image("a", 0.0), image("b", 0.0), image("c", 1.0)],
+            ..Reconstruction::default()
+        };
+        let ties = [(0, 0..9), (1, 9..18)].into_iter().flat_map(|(first, at)| at.map(move |at| (first, at)));
+        for (first, feature) in ties {
+            let track = [first, 2].map(|image| Observation { image: ImageId(image), feature }).to_vec();
+            model.points.push(ReconstructionPoint {
+                position: Vector3::new(0.0, 0.0, 8.0),
+                track,
+                color: [0; 3],
+                error_sigma: 0.0,
+                aligned: None,
+                covariance: None,
+            });
+        }
+        let outvoted = |kind| {
+            let inliers = (0..300).map(|at| Match { first: at, second: at }).collect();
+            let two_view =
+                TwoView { kind, second_from_first: Rigid::identity(), inliers, median_parallax_rad: 0.0 };
+            let pair = PairGeometry { first: ImageId(0), second: ImageId(1), two_view };
+            assess(&QualityParams::default(), &model, &[pair]).outvoted
+        };
+        assert_eq!(outvoted(TwoViewKind::PureRotation), []);
+        let found = outvoted(TwoViewKind::General);
+        assert_eq!(found.iter().map(|pair| (pair.matches, pair.held_by)).collect::<Vec<_>>(), [(300, 9)]);
+    }
+
+    #[test]
+    fn matches_count_against_a_model_where_it_uses_few_or_is_turned_far() {
+        let pair = |matches, used, rotation_deg| PairDisagreement {
+            first: ImageId(0),
+            second: ImageId(1),
+            matches,
+            used,
+            rotation_deg,
+        };
+        assert!(pair(300, 20, 0.5).is_heavy() && pair(300, 90, 90.0).is_heavy());
+        assert!(!pair(300, 90, 8.0).is_heavy() && !pair(40, 0, 90.0).is_heavy());
     }
 
     #[test]

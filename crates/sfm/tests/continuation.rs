@@ -3,7 +3,7 @@
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
+use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
 use setloc_sfm::{
     BaselineLength, CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, PairGeometry,
     Rigid, TwoViewParams, reconstruct, synthetic::normal, verify_pair,
@@ -156,7 +156,7 @@ impl Corner {
         });
         let input = MapperInput {
             cameras: vec![self.camera.clone(), of_target.clone()],
-            camera_fixed: vec![true, false],
+            calibrations: vec![Calibration::Known, Calibration::Guessed],
             images: images.collect(),
             pairs: &pairs,
             putative: &[],

@@ -3,7 +3,7 @@
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
+use setloc_features::{Calibration, Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
 use setloc_sfm::{
     CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, MergeVerdict, PairGeometry,
     PutativePair, Rigid, Similarity, TwoViewParams, reconstruct, verify_pair,
@@ -118,8 +118,8 @@ impl Street {
         found
     }
 
-    fn map(&self, cameras: &[Camera], fixed: bool) -> MapperOutput {
-        self.map_pairs(&MapperParams::default(), cameras, fixed, &self.verified_pairs(cameras))
+    fn map(&self, cameras: &[Camera], calibration: Calibration) -> MapperOutput {
+        self.map_pairs(&MapperParams::default(), cameras, calibration, &self.verified_pairs(cameras))
     }
 
     fn verified_pairs(&self, cameras: &[Camera]) -> Vec<PairGeometry> {
@@ -148,7 +148,7 @@ impl Street {
         &self,
         params: &MapperParams,
         cameras: &[Camera],
-        fixed: bool,
+        calibration: Calibration,
         pairs: &[PairGeometry],
     ) -> MapperOutput {
         // Photos share one camera, panoramas have one each: both are allowed.
@@ -159,7 +159,7 @@ impl Street {
         });
         let cameras = if shared { vec![cameras[0].clone()] } else { cameras.to_vec() };
         let input = MapperInput {
-            camera_fixed: vec![fixed; cameras.len()],
+            calibrations: vec![calibration; cameras.len()],
             cameras,
             images: images.collect(),
             pairs,
@@ -210,7 +210,7 @@ impl Street {
 #[test]
 fn a_street_of_panoramas_is_mapped_to_millimetres() {
     let street = Street::of_panoramas(10, 0.3, 0, 1);
-    let output = street.map(&street.cameras, true);
+    let output = street.map(&street.cameras, Calibration::Known);
     let (registered, worst_m, worst_deg) = street.errors(&output);
     assert_eq!((registered, output.components.len()), (10, 1));
     assert!(worst_m < 0.01 && worst_deg < 0.02, "{worst_m} m {worst_deg} deg");
@@ -220,7 +220,7 @@ fn a_street_of_panoramas_is_mapped_to_millimetres() {
 fn a_facade_that_stands_twice_does_not_fold_the_street() {
     for seed in 2..5 {
         let street = Street::of_panoramas(12, 0.3, 350, seed);
-        let output = street.map(&street.cameras, true);
+        let output = street.map(&street.cameras, Calibration::Known);
         let (registered, worst_m, worst_deg) = street.errors(&output);
         assert_eq!(registered, 12, "seed {seed}");
         assert!(worst_m < 0.02 && worst_deg < 0.05, "seed {seed}: {worst_m} m {worst_deg} deg");
@@ -258,7 +258,7 @@ fn found_of_last(other: &Camera) -> Camera {
     let pairs = street.verified_pairs(&guesses);
     let input = MapperInput {
         cameras: vec![guesses[0].clone(), guesses[8].clone()],
-        camera_fixed: vec![true, false],
+        calibrations: vec![Calibration::Known, Calibration::Guessed],
         images: images.collect(),
         pairs: &pairs,
         putative: &[],
@@ -296,10 +296,55 @@ fn found_of_all(truth: &Camera, guess: &Camera) -> (Camera, f64) {
         (truth.clone(), Rigid::new(turn, center))
     });
     let street = Street::new(views.collect(), 0.3, 0, 3);
-    let output = street.map(&vec![guess.clone(); 9], false);
+    let output = street.map(&vec![guess.clone(); 9], Calibration::Guessed);
     let (registered, worst_m, _) = street.errors(&output);
     assert_eq!(registered, 9);
     (output.components[0].cameras[0].clone(), worst_m)
+}
+
+/// Nine photos given one camera, the last of them with another focal length: the photos that share each camera in what is
+/// found, by places, the doubtful guesses, the focal lengths, and the worst error in metres.
+fn found_of_one_given(last: f64, given: &Camera) -> (Vec<Vec<usize>>, usize, Vec<f64>, f64) {
+    let views = (0..9).map(|k| {
+        let turn = UnitQuaternion::from_euler_angles(0.0, -0.7 + 0.09 * f64::from(k), 0.0);
+        let center = Vector3::new(3.0 - 0.7 * f64::from(k), 0.1 * f64::from(k % 3), f64::from(k));
+        let focal = if k == 8 { last } else { 1250.0 };
+        (radial(1600, 1200, focal, [-0.05, 0.0]), Rigid::new(turn, center))
+    });
+    let street = Street::new(views.collect(), 0.3, 0, 3);
+    let output = street.map(&vec![given.clone(); 9], Calibration::Guessed);
+    let (registered, worst_m, _) = street.errors(&output);
+    assert_eq!(registered, 9);
+    let model = &output.components[0];
+    let mut groups: Vec<(CameraId, Vec<usize>)> = Vec::new();
+    for (at, image) in model.images.iter().enumerate() {
+        match groups.iter_mut().find(|(camera, _)| *camera == image.camera) {
+            Some((_, group)) => group.push(at),
+            None => groups.push((image.camera, vec![at])),
+        }
+    }
+    let focal = groups.iter().map(|(camera, _)| model.cameras[camera.index()].focal_length()).collect();
+    let groups = groups.into_iter().map(|(_, group)| group).collect();
+    (groups, output.report.doubtful.len(), focal, worst_m)
+}
+
+#[test]
+fn a_photo_that_does_not_share_the_camera_that_it_was_given_gets_its_own() {
+    let given = radial(1600, 1200, 1240.0, [-0.04, 0.0]);
+    let (groups, doubtful, focal, worst_m) = found_of_one_given(1600.0, &given);
+    assert_eq!((groups, doubtful), (vec![(0..8).collect(), vec![8]], 0));
+    assert!((focal[0] / 1250.0 - 1.0).abs() < 0.01 && (focal[1] / 1600.0 - 1.0).abs() < 0.01, "{focal:?}");
+    assert!(worst_m < 0.05, "{worst_m} m");
+    let (groups, doubtful, ..) = found_of_one_given(1250.0, &given);
+    assert_eq!((groups, doubtful), (vec![(0..9).collect::<Vec<_>>()], 0));
+}
+
+#[test]
+fn a_bare_guess_that_photos_do_not_share_is_doubtful_and_stays_one() {
+    let guess = Camera::from_focal_guess(1600, 1200, 1500.0);
+    let (groups, doubtful, ..) = found_of_one_given(1400.0, &guess);
+    assert_eq!((groups, doubtful), (vec![(0..9).collect::<Vec<_>>()], 1));
+    assert_eq!(found_of_one_given(1250.0, &guess).1, 0);
 }
 
 #[test]
@@ -345,7 +390,7 @@ fn photos_turned_on_the_spot_are_mapped_as_one_standpoint() {
         (camera.clone(), Rigid::new(UnitQuaternion::from_axis_angle(&Vector3::y_axis(), yaw), center))
     });
     let street = Street::new(views.collect(), 0.3, 0, 11);
-    let output = street.map(&street.cameras, true);
+    let output = street.map(&street.cameras, Calibration::Known);
     let (registered, center, _) = street.errors(&output);
     // The centres lie within a metre of a line, so a frame aligned by them turns about it by 0.2° for 4 mm.
     let rotation = street.relative_rotation_error_deg(&output);
@@ -367,7 +412,7 @@ fn two_streets_without_a_common_view_are_two_components() {
         }
     }
     street.look = (0..200_000).collect();
-    let output = street.map(&street.cameras, true);
+    let output = street.map(&street.cameras, Calibration::Known);
     let sizes: Vec<usize> =
         output.components.iter().map(|component| component.registered().count()).collect();
     assert_eq!(sizes, [5, 5]);
@@ -397,7 +442,7 @@ fn pairs_that_promise_much_and_give_nothing_keep_no_other_street_from_being_mapp
         }
     }
     let params = MapperParams { max_initial_pairs: 4, ..MapperParams::default() };
-    let output = street.map_pairs(&params, &street.cameras, true, &pairs);
+    let output = street.map_pairs(&params, &street.cameras, Calibration::Known, &pairs);
     let registered: Vec<Vec<u32>> = output
         .components
         .iter()
@@ -468,7 +513,7 @@ impl Street {
             ..InputImage::new(&self.names[index], CameraId(index as u32), &self.features[index])
         });
         let input = MapperInput {
-            camera_fixed: vec![true; self.cameras.len()],
+            calibrations: vec![Calibration::Known; self.cameras.len()],
             cameras: self.cameras.clone(),
             images: images.collect(),
             pairs: &pairs,
@@ -554,7 +599,7 @@ fn same_input_same_seed_same_model_whatever_the_threads() {
             .num_threads(threads)
             .build()
             .unwrap()
-            .install(|| street.map(&street.cameras, true))
+            .install(|| street.map(&street.cameras, Calibration::Known))
     };
     assert_eq!(on(1), on(2));
 }

@@ -5,7 +5,7 @@ use std::ops::Range;
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{Camera, CameraModel, ImageFeatures, Keypoint, Match};
+use setloc_features::{Calibration, Camera, CameraModel, ImageFeatures, Keypoint, Match};
 use setloc_sfm::{
     CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, PairGeometry, PutativePair,
     Rigid, Similarity, TwoViewParams, reconstruct, verify_pair,
@@ -158,7 +158,7 @@ impl Room {
             .map(|(features, name)| InputImage::new(name, CameraId(0), features));
         let input = MapperInput {
             cameras: vec![self.camera.clone()],
-            camera_fixed: vec![true],
+            calibrations: vec![Calibration::Known],
             images: images.collect(),
             pairs: &pairs,
             putative: &putative,

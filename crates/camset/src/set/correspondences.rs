@@ -131,15 +131,11 @@ pub(crate) fn set_rays(
 }
 
 impl SetRays {
-    /// Truncated score: Σ over correspondences of the mean of 1 − min(1, (e/T)²) over their rays.
-    pub(crate) fn score(
-        &self,
-        world_from_set: &Similarity,
-        max_error_sigmas: f64,
-        correspondences: usize,
-    ) -> f64 {
+    /// Truncated score: Σ over correspondences, each as much as it is worth, of the mean of 1 − min(1, (e/T)²) over their
+    /// rays.
+    pub(crate) fn score(&self, world_from_set: &Similarity, max_error_sigmas: f64, worth: &[f64]) -> f64 {
         let set_from_world = world_from_set.inverse();
-        let (mut gain, mut count) = (vec![0.0; correspondences], vec![0_usize; correspondences]);
+        let (mut gain, mut count) = (vec![0.0; worth.len()], vec![0_usize; worth.len()]);
         for (ray, &correspondence) in self.rays.iter().zip(&self.correspondence) {
             gain[correspondence] +=
                 1.0 - (ray.error_sigmas(&set_from_world) / max_error_sigmas).min(1.0).powi(2);
@@ -147,8 +143,9 @@ impl SetRays {
         }
         gain.iter()
             .zip(&count)
-            .filter(|(_, count)| **count > 0)
-            .map(|(gain, &count)| gain / count as f64)
+            .zip(worth)
+            .filter(|((_, count), _)| **count > 0)
+            .map(|((gain, &count), worth)| worth * gain / count as f64)
             .sum()
     }
 

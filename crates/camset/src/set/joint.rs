@@ -19,7 +19,7 @@ use crate::refine::{
     JointModel, JointObservations, JointPhoto, SceneView, Sighting, TiedPoint, refine_jointly,
 };
 use crate::single::{inliers, union};
-use crate::underfoot::Underfoot;
+use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
 use crate::{
     CamsetParams, GuidedParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization,
@@ -235,14 +235,17 @@ impl Component<'_> {
         let photos =
             SetPhotos { set_from_camera: &set_from_camera, members: self.members, evidence: self.evidence };
         let sights = self.sights(&set_from_camera, &rays);
-        let rigid = rigid_pose(params, &candidates, self.model, (&set_rays, &sights), &photos, seed);
+        let ground = Ground::of_scene(self.scene);
+        let worth: Vec<f64> = candidates.iter().map(|candidate| ground.worth(candidate.scene)).collect();
+        let rigid =
+            rigid_pose(params, (&candidates, &worth), self.model, (&set_rays, &sights), &photos, seed);
         let Some(rigid) = rigid else {
             let reasons =
                 vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];
             return ComponentAnswer::Refused { reasons, scene_points: vec![0; self.members.len()] };
         };
         let mut reasons = Vec::new();
-        let mut evidence = self.support(&rays, &set_from_camera, &candidates, &sights, &rigid);
+        let mut evidence = self.support(&rays, &set_from_camera, (&candidates, &worth), &sights, &rigid);
         if evidence.inliers < params.verdict.min_inliers {
             judge_support(&params.verdict, &evidence, &mut reasons);
             let mut scene_points = vec![0; self.members.len()];
@@ -458,7 +461,7 @@ impl Component<'_> {
         &self,
         rays: &[PhotoRays<'_>],
         set_from_camera: &[Rigid],
-        candidates: &[SetCorrespondence],
+        (candidates, worth): (&[SetCorrespondence], &[f64]),
         sights: &Sights,
         rigid: &RigidPose,
     ) -> Evidence {
@@ -511,13 +514,16 @@ impl Component<'_> {
         for (slot, features) in shown {
             cells = cells.max(occupied_cells(&rays[slot], features.into_iter()));
         }
+        let agreeing_worth: f64 = rigid.agreeing.iter().map(|&agreeing| worth[agreeing]).sum();
+        let others = points.len() + of_lone(rigid.lone.len());
         Evidence {
             matches: candidates.len() + sighted.len() + of_lone(sights.lone.len()),
-            inliers: inliers + points.len() + of_lone(rigid.lone.len()),
+            inliers: inliers + others,
             sample: SAMPLE,
             log10_false_alarms: by_rays.min(by_sights).min(by_lone),
             cells,
             runner_up: rigid.runner_up,
+            runner_up_share: rigid.runner_up_worth / (agreeing_worth + others as f64),
             off_ground: self.off_ground(rays, set_from_camera, candidates, sights, rigid),
         }
     }

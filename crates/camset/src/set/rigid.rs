@@ -24,6 +24,8 @@ pub(crate) struct RigidPose {
     pub lone: Vec<usize>,
     /// Correspondences, or local points that the scene's images see, that agree with the best other pose.
     pub runner_up: usize,
+    /// What these are worth: the ground counts for less.
+    pub runner_up_worth: f64,
     pub observability: Observability,
 }
 
@@ -35,9 +37,11 @@ pub(crate) struct SetPhotos<'a> {
 }
 
 /// Finds the pose of greatest truncated score among that of the solver and, unless `params` leave them out, others.
+///
+/// `worth` is what each correspondence counts.
 pub(crate) fn rigid_pose(
     params: &CamsetParams,
-    correspondences: &[SetCorrespondence],
+    (correspondences, worth): (&[SetCorrespondence], &[f64]),
     model: &Reconstruction,
     (rays, sights): (&SetRays, &Sights),
     photos: &SetPhotos<'_>,
@@ -48,9 +52,17 @@ pub(crate) fn rigid_pose(
     let mut candidates: Vec<Similarity> = estimate(params, rays, seed).into_iter().collect();
     if params.other_hypotheses {
         candidates.extend(other_hypotheses(params, correspondences, model, (rays, sights), photos, seed));
+        // Where the ground repeats itself, what agrees best is a pose aside.
+        let stands: Vec<bool> = worth.iter().map(|worth| *worth >= 1.0).collect();
+        if stands.contains(&false) {
+            let standing = rays.subset(&stands);
+            let seed = seed ^ 0x57a2d;
+            candidates.extend(estimate(params, &standing, seed));
+            candidates.extend(by_single_photos(params, correspondences, model, &standing, photos, seed));
+        }
     }
     let bound = params.max_error_sigmas;
-    let score = |pose: &Similarity| rays.score(pose, bound, count) + sights.score(pose, bound);
+    let score = |pose: &Similarity| rays.score(pose, bound, worth) + sights.score(pose, bound);
     let mut best: Option<(Similarity, f64)> = None;
     for candidate in candidates {
         let value = score(&candidate);
@@ -79,13 +91,13 @@ pub(crate) fn rigid_pose(
         agreeing,
         sights: agreeing_sights,
         lone,
-        runner_up: by_rays.max(by_sights),
+        runner_up: by_rays.len().max(by_sights),
+        runner_up_worth: by_rays.iter().map(|&rival| worth[rival]).sum::<f64>().max(by_sights as f64),
         observability,
     })
 }
 
-/// Poses by photos localized alone, by what the scene's images show, and those that single photos suggest together with
-/// the depths of their local points.
+/// Poses by photos localized alone, by what the scene's images show, and those that single photos suggest.
 fn other_hypotheses(
     params: &CamsetParams,
     correspondences: &[SetCorrespondence],
@@ -94,9 +106,23 @@ fn other_hypotheses(
     photos: &SetPhotos<'_>,
     seed: u64,
 ) -> Vec<Similarity> {
-    let SetPhotos { set_from_camera, members, evidence } = *photos;
-    let mut found = alignments(set_from_camera, members, evidence);
+    let mut found = alignments(photos.set_from_camera, photos.members, photos.evidence);
     found.extend(sights.estimate(params, &[], &rays.rays, seed));
+    found.extend(by_single_photos(params, correspondences, model, rays, photos, seed));
+    found
+}
+
+/// Poses that single photos suggest together with the depths of their local points, or with the other photos' rays.
+fn by_single_photos(
+    params: &CamsetParams,
+    correspondences: &[SetCorrespondence],
+    model: &Reconstruction,
+    rays: &SetRays,
+    photos: &SetPhotos<'_>,
+    seed: u64,
+) -> Vec<Similarity> {
+    let SetPhotos { set_from_camera, members, evidence } = *photos;
+    let mut found = Vec::new();
     for (slot, &photo) in members.iter().enumerate() {
         let in_set = &set_from_camera[slot];
         let alone = evidence[photo]
@@ -243,7 +269,7 @@ impl SetRays {
     }
 }
 
-/// Support of the best pose that the remaining rays give, when it puts the set elsewhere.
+/// What agrees with the best pose that the remaining rays give, when it puts the set elsewhere.
 fn runner_up(
     params: &CamsetParams,
     rest: &SetRays,
@@ -251,8 +277,8 @@ fn runner_up(
     set_from_camera: &[Rigid],
     correspondences: usize,
     seed: u64,
-) -> usize {
-    let Some(pose) = estimate(params, rest, seed ^ 0x5eed) else { return 0 };
+) -> Vec<usize> {
+    let Some(pose) = estimate(params, rest, seed ^ 0x5eed) else { return Vec::new() };
     let set_from_world = best.inverse();
     let depth = rest
         .rays
@@ -264,7 +290,7 @@ fn runner_up(
     let moved = set_from_camera
         .iter()
         .any(|camera| !same_pose(&pose.transform_pose(camera), &best.transform_pose(camera), depth));
-    if moved { rest.agreeing(&pose, params.max_error_sigmas, correspondences).len() } else { 0 }
+    if moved { rest.agreeing(&pose, params.max_error_sigmas, correspondences) } else { Vec::new() }
 }
 
 /// Sights, as of points, that agree with the best pose that the remaining ones give, when it puts the set elsewhere.

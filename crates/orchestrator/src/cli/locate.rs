@@ -280,20 +280,14 @@ mod tests {
     use setloc_features::Camera;
 
     use super::*;
-    use crate::fingerprint::ContentHash;
 
     #[test]
     fn what_photos_tell_of_their_cameras_alone_is_said_once() {
         let camera = |focal| Camera::from_focal_guess(40, 30, focal);
         let image = |name: &str, calibration, camera_origin| SourceImage {
-            name: name.to_owned(),
-            path: PathBuf::new(),
-            hash: ContentHash::of(b""),
-            camera: camera(48.0),
             calibration,
             camera_origin,
-            position: None,
-            mask: None,
+            ..SourceImage::guessed(name, camera(48.0))
         };
         let photo = |name: &str, verdict, focal| PhotoLocalization {
             name: name.to_owned(),

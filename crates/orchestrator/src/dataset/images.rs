@@ -35,6 +35,23 @@ pub struct SourceImage {
     pub mask: Option<(PathBuf, ContentHash)>,
 }
 
+#[cfg(test)]
+impl SourceImage {
+    /// An image of a guessed camera that is in no file.
+    pub fn guessed(name: &str, camera: Camera) -> Self {
+        Self {
+            name: name.to_owned(),
+            path: PathBuf::new(),
+            hash: ContentHash::of(name.as_bytes()),
+            camera,
+            calibration: Calibration::Guessed,
+            camera_origin: CameraOrigin::Listed,
+            position: None,
+            mask: None,
+        }
+    }
+}
+
 impl SourceImage {
     /// Whether this camera was guessed of the image.
     pub fn is_guess(&self, camera: &Camera) -> bool {
@@ -42,27 +59,24 @@ impl SourceImage {
     }
 }
 
-/// The images with the cameras that are told in place of guessed ones, known as well as is told; `None` when none is
-/// told.
+/// The images with the cameras that are told, by their places, in place of guessed ones, known as well as is told; `None`
+/// when none is told.
 pub fn with_told_cameras(
     images: &[SourceImage],
-    told: impl Fn(&Camera) -> Option<(Camera, Calibration)>,
+    told: impl Fn(usize) -> Option<(Camera, Calibration)>,
 ) -> Option<Vec<SourceImage>> {
-    let mut known: Vec<(&Camera, Option<(Camera, Calibration)>)> = Vec::new();
-    for image in images.iter().filter(|image| image.calibration == Calibration::Guessed) {
-        if known.iter().all(|(guess, _)| **guess != image.camera) {
-            known.push((&image.camera, told(&image.camera)));
-        }
-    }
-    let with_camera = |image: &SourceImage| {
-        let found = known.iter().find(|(guess, _)| image.is_guess(guess)).and_then(|(_, told)| told.clone());
-        let camera_origin = CameraOrigin::Estimated;
-        found.map_or_else(
-            || image.clone(),
-            |(camera, calibration)| SourceImage { camera, calibration, camera_origin, ..image.clone() },
-        )
+    let told_of = |(at, image): (usize, &SourceImage)| {
+        (image.calibration == Calibration::Guessed).then(|| told(at)).flatten()
     };
-    known.iter().any(|(_, told)| told.is_some()).then(|| images.iter().map(with_camera).collect())
+    let told: Vec<_> = images.iter().enumerate().map(told_of).collect();
+    let is_any_told = told.iter().any(Option::is_some);
+    let with_camera = |(image, told): (&SourceImage, Option<(Camera, Calibration)>)| match told {
+        Some((camera, calibration)) => {
+            SourceImage { camera, calibration, camera_origin: CameraOrigin::Estimated, ..image.clone() }
+        }
+        None => image.clone(),
+    };
+    is_any_told.then(|| images.iter().zip(told).map(with_camera).collect())
 }
 
 /// Where an image's camera comes from.

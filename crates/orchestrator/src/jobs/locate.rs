@@ -108,7 +108,8 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
         let pairs = (&what.config.matching, &what.config.two_view);
         Ok(match_views(&what.config.camset.views, pairs, scene, features, &likely, &queries, seed))
     };
-    let models = LocalModels { components: &model.components, open: &model.open_pairs };
+    let models =
+        LocalModels { components: &model.components, open: &model.open_pairs, outvoted: &model.outvoted };
     let params = &what.config.camset;
     let located: SetLocalization =
         locate_set_anywhere(params, &components, &queries, &alone, models, views, seed)?;

@@ -6,11 +6,11 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use serde_json::json;
-use setloc_features::{Camera, ImageFeatures, Match};
+use setloc_features::{Calibration, Camera, ImageFeatures, Match};
 use setloc_sfm::{
-    CameraId, GeoregisterParams, Georegistration, ImageId, InputImage, MapperInput, MapperParams,
-    MapperReport, MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction, TwoViewParams,
-    assess, georegister, reconstruct, verify_pair,
+    CameraId, GeoregisterParams, Georegistration, ImageId, InputImage, MapperInput, MapperOutput,
+    MapperParams, MapperReport, MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction,
+    TwoViewParams, assess, georegister, reconstruct, verify_pair,
 };
 
 use super::alignment::add_alignment;
@@ -81,9 +81,9 @@ pub fn add_model(
         ..config.sfm.clone()
     };
     let params = json!({
-        "sfm": mapper, "two_view": config.two_view, "quality": config.quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "camera_fixed": cameras.fixed,
+        "sfm": mapper, "two_view": config.two_view, "quality": config.quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "calibrations": cameras.calibrations,
     });
-    let fixed = cameras.fixed.clone();
+    let fixed = cameras.calibrations.iter().map(|calibration| calibration.is_settled()).collect();
     let stage = ModelConfig {
         mapper,
         two_view: config.two_view.clone(),
@@ -250,24 +250,43 @@ fn add_pair(
 /// Cameras shared by the images that have the same one.
 struct SharedCameras {
     cameras: Vec<Camera>,
-    fixed: Vec<bool>,
+    calibrations: Vec<Calibration>,
     of_image: Vec<usize>,
 }
 
 fn share_cameras(images: &[SourceImage]) -> SharedCameras {
-    let mut shared = SharedCameras { cameras: Vec::new(), fixed: Vec::new(), of_image: Vec::new() };
+    let mut shared = SharedCameras { cameras: Vec::new(), calibrations: Vec::new(), of_image: Vec::new() };
     for image in images {
-        let same = |at: &usize| {
-            shared.cameras[*at] == image.camera && shared.fixed[*at] == image.calibration.is_settled()
-        };
+        let same =
+            |at: &usize| shared.cameras[*at] == image.camera && shared.calibrations[*at] == image.calibration;
         let at = (0..shared.cameras.len()).find(same).unwrap_or_else(|| {
             shared.cameras.push(image.camera.clone());
-            shared.fixed.push(image.calibration.is_settled());
+            shared.calibrations.push(image.calibration);
             shared.cameras.len() - 1
         });
         shared.of_image.push(at);
     }
     shared
+}
+
+/// Which images have a guessed camera with others that seem not to have the same, by a model of them all in this order.
+pub fn divided_guesses(images: &[SourceImage], model: &MapperOutput) -> Vec<bool> {
+    let of_image = share_cameras(images).of_image;
+    let mut is_divided: Vec<bool> =
+        of_image.iter().map(|&camera| model.report.doubtful.contains(&CameraId(camera as u32))).collect();
+    for component in &model.components {
+        let given = |id: ImageId| {
+            let image = &component.images[id.index()];
+            Some((*of_image.get(image_of_place_holder(&image.name)?)?, image.camera))
+        };
+        let registered: Vec<_> = component.registered().filter_map(given).collect();
+        for (camera, is_divided) in of_image.iter().zip(&mut is_divided) {
+            let mut alike = registered.iter().filter(|(other, _)| other == camera).map(|(_, used)| used);
+            let first = alike.next();
+            *is_divided |= alike.any(|used| Some(used) != first);
+        }
+    }
+    is_divided
 }
 
 /// Parameters of the mapping job.
@@ -320,12 +339,12 @@ fn run_model(
         ..InputImage::new(name, CameraId(input.cameras.of_image[*at] as u32), features)
     });
     let images = images.collect();
-    let (cameras, camera_fixed) = (input.cameras.cameras.clone(), input.cameras.fixed.clone());
+    let (cameras, calibrations) = (input.cameras.cameras.clone(), input.cameras.calibrations.clone());
     let positions: Vec<Option<MeasuredPosition>> =
         features.iter().map(|(at, _)| input.positions[*at]).collect();
     let input_of_mapper = MapperInput {
         cameras,
-        camera_fixed,
+        calibrations,
         images,
         pairs: &pairs,
         putative: &putative,
@@ -342,6 +361,7 @@ fn run_model(
     for (at, component) in output.components.iter_mut().enumerate() {
         let report = assess(quality, component, &pairs);
         output.report.warnings.extend(report.sentences(component));
+        output.outvoted.push(report.outvoted);
         place(&mut output.report, georegistration, component, &positions, seed);
         output.report.warnings.extend(apart(at, component, &output.report.georegistrations));
     }
@@ -456,6 +476,29 @@ mod tests {
         assert!(many[0].starts_with("3 of 12 measured positions contradict the model"), "{many:?}");
         assert!(many[0].ends_with("a (12.0 m), b (16.1 m), c (8.0 m)"), "{many:?}");
         assert!(contradicted_positions(&[], 5).is_empty());
+    }
+
+    #[test]
+    fn photos_that_do_not_share_a_guess_are_told() {
+        let image = |name: &str, width: u32| {
+            SourceImage::guessed(name, Camera::from_focal_guess(width, 1200, 1920.0))
+        };
+        let images = [image("a", 1600), image("b", 1600), image("c", 1280), image("d", 1280)];
+        let model = |cameras: [u32; 4], doubtful: Vec<CameraId>| {
+            let image = |(at, camera): (usize, u32)| setloc_sfm::ReconstructionImage {
+                name: place_holder(at),
+                camera: CameraId(camera),
+                world_from_camera: Some(setloc_sfm::Rigid::identity()),
+            };
+            let images = cameras.into_iter().enumerate().map(image).collect();
+            let components = vec![Reconstruction { images, ..Reconstruction::default() }];
+            let report = MapperReport { doubtful, ..MapperReport::default() };
+            MapperOutput { components, report, ..MapperOutput::default() }
+        };
+        let divided = |cameras, doubtful| divided_guesses(&images, &model(cameras, doubtful));
+        assert_eq!(divided([0, 0, 1, 1], Vec::new()), [false; 4]);
+        assert_eq!(divided([0, 2, 1, 1], Vec::new()), [true, true, false, false]);
+        assert_eq!(divided([0, 0, 1, 1], vec![CameraId(1)]), [false, false, true, true]);
     }
 
     #[test]

@@ -133,7 +133,7 @@ fn cost(model: &Model<'_>, params: &MapperParams, image: ImageId, features: &BTr
 mod tests {
     use nalgebra::{Matrix6, UnitQuaternion, Vector3};
     use rand::Rng;
-    use setloc_features::{Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
+    use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
 
     use super::*;
     use crate::{
@@ -225,7 +225,7 @@ mod tests {
             let images = photos.iter().map(|features| InputImage::new("photo", CameraId(0), features));
             let input = MapperInput {
                 cameras: vec![camera.clone()],
-                camera_fixed: vec![true],
+                calibrations: vec![Calibration::Known],
                 images: images.collect(),
                 pairs: &pairs,
                 putative: &[],

@@ -19,7 +19,7 @@ pub(super) fn choose_lenses(model: &mut Model<'_>, params: &MapperParams) -> boo
     let mut changed = false;
     for camera in 0..model.cameras.len() {
         let lens = &model.cameras[camera];
-        let is_open = !model.input.camera_fixed[camera] && lens.may_be_fisheye();
+        let is_open = !model.input.is_fixed(camera) && lens.may_be_fisheye();
         if !is_open || !tells_camera(model, &model.registered_with(camera)) {
             continue;
         }

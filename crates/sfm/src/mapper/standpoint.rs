@@ -10,7 +10,9 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use setloc_features::{Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match, Rays, SimulatedView};
+use setloc_features::{
+    Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match, Rays, SimulatedView,
+};
 
 use super::{InputImage, MapperInput, MapperOutput, MapperParams};
 use crate::{
@@ -48,7 +50,7 @@ pub(super) struct Standpoints<'a> {
     mosaics: Vec<Mosaic>,
     features: Vec<Cow<'a, ImageFeatures>>,
     cameras: Vec<Camera>,
-    camera_fixed: Vec<bool>,
+    calibrations: Vec<Calibration>,
     camera_of: Vec<CameraId>,
     pairs: Vec<PairGeometry>,
 }
@@ -76,7 +78,7 @@ impl<'a> Standpoints<'a> {
             mosaics: Vec::new(),
             features: Vec::new(),
             cameras: input.cameras.clone(),
-            camera_fixed: input.camera_fixed.clone(),
+            calibrations: input.calibrations.clone(),
             camera_of: Vec::new(),
             pairs: Vec::new(),
         };
@@ -107,7 +109,7 @@ impl<'a> Standpoints<'a> {
             .collect();
         MapperInput {
             cameras: self.cameras.clone(),
-            camera_fixed: self.camera_fixed.clone(),
+            calibrations: self.calibrations.clone(),
             images,
             pairs: &self.pairs,
             putative: &[],
@@ -191,7 +193,7 @@ impl<'a> Standpoints<'a> {
             self.features.push(Cow::Owned(joined_features(&mut mosaic, images, rays, &sphere)));
             self.camera_of.push(CameraId(self.cameras.len() as u32));
             self.cameras.push(sphere);
-            self.camera_fixed.push(true);
+            self.calibrations.push(Calibration::Known);
         }
         self.mosaics.push(mosaic);
     }
@@ -330,7 +332,7 @@ fn candidate_turns<'a>(params: &MapperParams, input: &MapperInput<'a>) -> Vec<&'
         .filter(|pair| {
             let known = |image: ImageId| {
                 let camera = input.images[image.index()].camera.index();
-                input.camera_fixed[camera] && !input.cameras[camera].is_panoramic()
+                input.is_fixed(camera) && !input.cameras[camera].is_panoramic()
             };
             pair.two_view.kind == TwoViewKind::PureRotation
                 && pair.two_view.inliers.len() >= params.min_turn_matches

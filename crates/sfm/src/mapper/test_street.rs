@@ -2,7 +2,7 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::Rng;
-use setloc_features::{Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
+use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
 
 use super::structure::triangulate_image;
 use super::{InputImage, MapperInput, MapperParams, correspondence::CorrespondenceGraph, model::Model};
@@ -74,7 +74,7 @@ impl Street {
         let images = self.features.iter().map(|features| InputImage::new("panorama", CameraId(0), features));
         MapperInput {
             cameras: vec![self.camera.clone()],
-            camera_fixed: vec![true],
+            calibrations: vec![Calibration::Known],
             images: images.collect(),
             pairs: &self.pairs,
             putative: &[],

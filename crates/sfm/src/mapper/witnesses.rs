@@ -126,7 +126,7 @@ impl Witnesses {
 #[cfg(test)]
 mod tests {
     use nalgebra::UnitQuaternion;
-    use setloc_features::{Camera, ImageFeatures, Keypoint};
+    use setloc_features::{Calibration, Camera, ImageFeatures, Keypoint};
 
     use super::*;
     use crate::{
@@ -167,7 +167,7 @@ mod tests {
             .collect();
         let input = MapperInput {
             cameras: vec![camera],
-            camera_fixed: vec![true],
+            calibrations: vec![Calibration::Known],
             images: features.iter().map(|features| InputImage::new("", CameraId(0), features)).collect(),
             pairs: &pairs,
             putative: &[],
