@@ -26,6 +26,10 @@ const MIN_FOCAL_CHANGE: f64 = 0.03;
 const MIN_IMAGES: usize = 3;
 /// How much focal lengths may differ that are tried as one, as a share, in the order tried.
 const SPREADS: [f64; 4] = [0.08, 0.04, 0.02, 0.01];
+/// What a camera more has to take from the cost of images that do not share one, and as a share of it: of photos that do it
+/// takes half of that, where several zooms are taken for one a merged one costs twice as much.
+const CAMERA_COST: f64 = 5.0;
+const CAMERA_SHARE: f64 = 0.004;
 /// Of more images of one camera this many are given their own at first; most unknowns of cameras are no sparse ones.
 const MOST_ASKED: usize = 60;
 
@@ -160,10 +164,17 @@ impl Trial<'_, '_> {
         let alone: Vec<Vec<ImageId>> = self.images.iter().map(|&image| vec![image]).collect();
         let own = if alone.len() > MOST_ASKED { self.fit(&alone, self.component) } else { apart };
         let focal: Vec<f64> = own.images.iter().map(|image| image.focal).collect();
-        let alike = SPREADS.map(|spread| grouped(&focal, spread));
-        let alike = alike.map(|groups| groups.iter().map(|group| self.these(group)).collect::<Vec<_>>());
-        let found = alike.into_iter().find(|groups| self.fit(groups, &own.component).is_as_good_as(&own));
-        found.unwrap_or(alone)
+        let a_camera = CAMERA_COST.max(CAMERA_SHARE * own.cost);
+        let mut best = (own.cost + a_camera * alone.len() as f64, alone);
+        for spread in SPREADS {
+            let groups: Vec<_> = grouped(&focal, spread).iter().map(|group| self.these(group)).collect();
+            let fit = self.fit(&groups, &own.component);
+            let cost = fit.cost + a_camera * groups.len() as f64;
+            if cost < best.0 && fit.is_as_good_as(&own) {
+                best = (cost, groups);
+            }
+        }
+        best.1
     }
 
     fn these(&self, places: &[usize]) -> Vec<ImageId> {
