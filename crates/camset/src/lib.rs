@@ -58,8 +58,10 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// known are free under what holds for usual photos. 23: what lies on the ground alone localizes nothing.
 /// 24: what several photos alone contradict is not trusted. 25: unknown cameras may be fisheyes.
 /// 26: far walls are no ground, and one standpoint contradicts a local model once.
-/// 27: what too little tells the focal length of is uncertain.
-pub const VERSION: u32 = 28;
+/// 27: what too little tells the focal length of is uncertain. 28: the ground counts for less, and what stronger pairs
+/// contradict is uncertain. 29: what guided matching shows beside the ground counts,
+/// and where hardly any match agrees, it chooses the pose.
+pub const VERSION: u32 = 29;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

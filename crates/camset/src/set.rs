@@ -488,6 +488,33 @@ mod tests {
     }
 
     #[test]
+    fn where_hardly_any_match_agrees_guided_matching_tells_the_pose() {
+        let world = World::chain(6, 0.2, 1);
+        // All but one in 60 scene points have another that is as like, for the ratio test.
+        let (_, found) = locate_with_alone(&world, |alone| {
+            for alone in alone {
+                alone.photo.verdict = Verdict::NotLocalized;
+                alone.photo.world_from_camera = None;
+                alone.inliers.clear();
+                for nearest in &mut alone.nearest {
+                    let repeated = nearest.first.filter(|first| !first.point.0.is_multiple_of(60));
+                    if let Some(first) = repeated {
+                        let point = setloc_sfm::PointId(first.point.0 ^ 1);
+                        nearest.second = Some(setloc_index::Neighbour { point, ..first });
+                    }
+                }
+            }
+        });
+        let (center, rotation) = worst_errors(&world, &found.refined);
+        assert!(center < 0.2 && rotation < 0.3, "{center} {rotation}");
+        for photo in &found.refined {
+            let reasons = photo.reasons.join("; ");
+            assert_eq!(photo.verdict, Verdict::Localized, "{}: {reasons}", photo.name);
+            assert!(reasons.contains("guided matching shows"), "{reasons}");
+        }
+    }
+
+    #[test]
     fn one_photo_that_contradicts_counts_once_whatever_its_standpoint_has() {
         let turned = |i: u32| {
             let center = Vector3::new(0.5, -1.5, 20.0 + 6.0 * f64::from(i / 2));

@@ -10,7 +10,7 @@ use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, o
 use crate::guided::guided_matches;
 use crate::refine::{JointModel, JointObservations, JointPhoto, refine_jointly};
 use crate::underfoot::{Ground, Underfoot};
-use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
+use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_precision, judge_support, weaker};
 use crate::{PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, SingleParams, Verdict};
 
 /// Points in a minimal sample of P3P.
@@ -130,7 +130,7 @@ fn solve(
         agreeing.iter().map(|m| (pose.translation, scene.index.position(m.point))).collect();
     let off_ground =
         Underfoot::of_scene(scene).map_or(seen.len(), |underfoot| underfoot.count_elsewhere(&seen));
-    let evidence = Evidence {
+    let mut evidence = Evidence {
         matches: matches.len(),
         inliers: agreeing.len(),
         sample: SAMPLE,
@@ -139,6 +139,7 @@ fn solve(
         runner_up: rivals.len(),
         runner_up_share: worth(&rivals) / worth(&agreeing),
         off_ground,
+        shown: 0,
     };
     if agreeing.len() < params.verdict.min_inliers {
         return Some(SinglePose {
@@ -163,6 +164,17 @@ fn solve(
     let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
     let inliers = inliers(&rays, scene.index, &pose, &candidates, params.max_error_sigmas);
+    if evidence.off_ground < MIN_OFF_GROUND
+        && let Some(underfoot) = Underfoot::of_scene(scene)
+    {
+        let shown = |slide: &Vector3<f64>| {
+            let aside = Rigid::new(pose.rotation, pose.translation + slide);
+            guided_matches(&params.guided, scene.index, &rays, nearest, &aside)
+        };
+        if let Some((shown, _)) = underfoot.count_shown_elsewhere(ground, depth, shown) {
+            evidence.off_ground = evidence.off_ground.max(shown);
+        }
+    }
     Some(SinglePose { camera, world_from_camera: pose, covariance, inliers, depth, evidence })
 }
 

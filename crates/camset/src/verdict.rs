@@ -23,10 +23,12 @@ pub(crate) struct Evidence {
     pub runner_up_share: f64,
     /// How many of the inliers lie elsewhere than on the ground.
     pub off_ground: usize,
+    /// Matches that guided matching shows beside them, where few agree and these stand out.
+    pub shown: usize,
 }
 
 /// Fewest inliers elsewhere than on the ground: three give a pose, one more would contradict a wrong one.
-const MIN_OFF_GROUND: usize = 4;
+pub(crate) const MIN_OFF_GROUND: usize = 4;
 
 /// Decides on the evidence for a pose alone: is it the right one?
 pub(crate) fn judge_support(
@@ -35,10 +37,21 @@ pub(crate) fn judge_support(
     reasons: &mut Vec<String>,
 ) -> Verdict {
     let Evidence {
-        matches, inliers, log10_false_alarms, cells, runner_up, runner_up_share, off_ground, ..
+        matches,
+        inliers,
+        log10_false_alarms,
+        cells,
+        runner_up,
+        runner_up_share,
+        off_ground,
+        shown,
+        ..
     } = *evidence;
     reasons.push(format!("{inliers} of {matches} matches to the scene agree on the pose"));
-    if inliers < params.min_inliers {
+    if shown > 0 {
+        reasons.push(format!("guided matching shows {shown}, by far more than poses aside do"));
+    }
+    if inliers.max(shown) < params.min_inliers {
         reasons.push(format!("a pose needs at least {} agreeing matches", params.min_inliers));
         return Verdict::NotLocalized;
     }
@@ -127,6 +140,7 @@ mod tests {
             runner_up: 4,
             runner_up_share: 0.1,
             off_ground: 30,
+            shown: 0,
         }
     }
 
@@ -138,6 +152,8 @@ mod tests {
     fn each_doubt_alone_keeps_a_pose_from_being_localized() {
         assert_eq!(judge(&good()), Verdict::Localized);
         assert_eq!(judge(&Evidence { inliers: 11, ..good() }), Verdict::NotLocalized);
+        assert_eq!(judge(&Evidence { inliers: 11, shown: 11, ..good() }), Verdict::NotLocalized);
+        assert_eq!(judge(&Evidence { inliers: 8, shown: 12, ..good() }), Verdict::Localized);
         assert_eq!(judge(&Evidence { log10_false_alarms: -1.0, ..good() }), Verdict::Uncertain);
         assert_eq!(judge(&Evidence { log10_false_alarms: f64::NAN, ..good() }), Verdict::Uncertain);
         assert_eq!(judge(&Evidence { cells: 2, ..good() }), Verdict::Uncertain);

@@ -90,7 +90,7 @@ pub fn best_answers<'a>(
 /// Locates photos; `target` is the photo that decides in [`Mode::Auto`].
 ///
 /// Where intrinsics of a set are a guess, the set is located twice: the second time with the cameras that the scene told the
-/// first time, which `folder` has afterwards. Photos alone keep the guess in [`Mode::Both`], which compares methods.
+/// first time, which `folder` has afterwards. Before, guesses that do not hold are improved by a model of the photos. Photos alone keep the guess in [`Mode::Both`], which compares methods.
 ///
 /// # Errors
 /// When the run was stopped or the store cannot be written.
@@ -126,10 +126,15 @@ pub fn locate(
         }
         let alone = mode == Mode::Both && located.single.is_empty();
         whole.absorb(run(session, folder, what, (name, target), (alone, true), &mut located)?);
-        if located.divided.contains(&true) {
-            let divided = located.divided.clone();
-            whole.absorb(improve_by_model(session, &mut folder.images, &divided, what, name)?);
-            whole.absorb(run(session, folder, what, (name, target), (false, true), &mut located)?);
+        let doubtful = doubtful_guesses(&folder.images, &located, target);
+        if doubtful.contains(&true) {
+            let mut improved = folder.clone();
+            whole.absorb(improve_by_model(session, &mut improved.images, &doubtful, what, name)?);
+            let mut again = located.clone();
+            whole.absorb(run(session, &improved, what, (name, target), (false, true), &mut again)?);
+            if located.divided.contains(&true) || again.verdicts() >= located.verdicts() {
+                (located, *folder) = (again, improved);
+            }
         }
         let images = with_estimated_cameras(&folder.images, &located.divided, located.set.as_ref());
         if let Some(images) = images {
@@ -153,6 +158,23 @@ pub fn locate(
 fn is_lone_guess(images: &[SourceImage], image: &SourceImage) -> bool {
     let alike = images.iter().filter(|other| other.is_guess(&image.camera)).count();
     image.calibration == Calibration::Guessed && alike < MIN_PHOTOS
+}
+
+/// Guesses that a first model of the photos is to improve: those that photos do not share, else, where the set does not
+/// localize its target, all that nothing has improved yet.
+///
+/// Local models are made of pairs that were verified with the guess, and where hardly anything of the scene is seen a model
+/// that is bent by a guess a tenth off agrees with nothing of it.
+fn doubtful_guesses(images: &[SourceImage], located: &Located, target: &str) -> Vec<bool> {
+    let photos = located.set.iter().flat_map(|set| &set.refined);
+    let is_found =
+        photos.into_iter().any(|photo| photo.name == target && photo.verdict == Verdict::Localized);
+    if is_found || located.divided.contains(&true) {
+        return located.divided.clone();
+    }
+    let is_open =
+        |image: &SourceImage| image.calibration == Calibration::Guessed && image.camera.is_bare_guess();
+    images.iter().map(is_open).collect()
 }
 
 /// Puts what photos that are localized alone tell of their cameras in place of guesses; meant for those that few photos

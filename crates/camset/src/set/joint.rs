@@ -20,7 +20,7 @@ use crate::refine::{
 };
 use crate::single::{inliers, union};
 use crate::underfoot::{Ground, Underfoot};
-use crate::verdict::{Evidence, judge_precision, judge_support, weaker};
+use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_precision, judge_support, weaker};
 use crate::{
     CamsetParams, GuidedParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization,
     Verdict, Views,
@@ -237,8 +237,13 @@ impl Component<'_> {
         let sights = self.sights(&set_from_camera, &rays);
         let ground = Ground::of_scene(self.scene);
         let worth: Vec<f64> = candidates.iter().map(|candidate| ground.worth(candidate.scene)).collect();
-        let rigid =
-            rigid_pose(params, (&candidates, &worth), self.model, (&set_rays, &sights), &photos, seed);
+        let shown = |pose: &Similarity| {
+            let poses = set_from_camera.iter().map(|camera| pose.transform_pose(camera)).collect();
+            let found = self.guided(&rays, poses);
+            found.iter().flatten().filter(|found| !ground.holds(found.point)).count()
+        };
+        let (given, sources) = ((&candidates[..], &worth[..]), (&set_rays, &sights));
+        let rigid = rigid_pose(params, given, self.model, sources, &photos, shown, seed);
         let Some(rigid) = rigid else {
             let reasons =
                 vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];
@@ -246,7 +251,24 @@ impl Component<'_> {
         };
         let mut reasons = Vec::new();
         let mut evidence = self.support(&rays, &set_from_camera, (&candidates, &worth), &sights, &rigid);
-        if evidence.inliers < params.verdict.min_inliers {
+        let is_weak = evidence.inliers < params.verdict.min_inliers;
+        if is_weak || evidence.off_ground < MIN_OFF_GROUND {
+            let shown = self.shown_off_ground(&ground, &rays, &set_from_camera, &candidates, &rigid);
+            if let Some((shown, log10_chance)) = shown {
+                let count = shown.iter().map(Vec::len).sum();
+                evidence.off_ground = evidence.off_ground.max(count);
+                if is_weak {
+                    let of_photo = |(shown, rays): (&Vec<SceneMatch>, &PhotoRays<'_>)| {
+                        occupied_cells(rays, shown.iter().map(|found| found.feature))
+                    };
+                    evidence.cells = shown.iter().zip(&rays).map(of_photo).fold(evidence.cells, usize::max);
+                    evidence.shown = count;
+                    evidence.log10_false_alarms = evidence.log10_false_alarms.min(log10_chance);
+                    evidence.runner_up_share = rigid.runner_up_worth / (evidence.inliers + count) as f64;
+                }
+            }
+        }
+        if evidence.inliers.max(evidence.shown) < params.verdict.min_inliers {
             judge_support(&params.verdict, &evidence, &mut reasons);
             let mut scene_points = vec![0; self.members.len()];
             for &(slot, _) in rigid.agreeing.iter().flat_map(|&agreeing| &candidates[agreeing].seen_by) {
@@ -525,6 +547,7 @@ impl Component<'_> {
             runner_up: rigid.runner_up,
             runner_up_share: rigid.runner_up_worth / (agreeing_worth + others as f64),
             off_ground: self.off_ground(rays, set_from_camera, candidates, sights, rigid),
+            shown: 0,
         }
     }
 
@@ -555,6 +578,47 @@ impl Component<'_> {
             !underfoot.is_below_horizon(&pose(lone.slot), bearing)
         };
         underfoot.count_elsewhere(&seen) + rigid.lone.iter().filter(is_above).count()
+    }
+
+    /// What guided matching shows each photo of the scene, where the photos stand so.
+    fn guided(&self, rays: &[PhotoRays<'_>], poses: Vec<Rigid>) -> Vec<Vec<SceneMatch>> {
+        let shown = |(slot, pose): (usize, Rigid)| {
+            let nearest = &self.evidence[self.members[slot]].nearest;
+            guided_matches(&self.params.guided, self.scene.index, &rays[slot], nearest, &pose)
+        };
+        poses.into_par_iter().enumerate().with_max_len(1).map(shown).collect()
+    }
+
+    /// What guided matching shows each photo elsewhere than on the ground, where that stands out, and log₁₀ of the chance of
+    /// as much from a wrong place.
+    fn shown_off_ground(
+        &self,
+        ground: &Ground,
+        rays: &[PhotoRays<'_>],
+        set_from_camera: &[Rigid],
+        candidates: &[SetCorrespondence],
+        rigid: &RigidPose,
+    ) -> Option<(Vec<Vec<SceneMatch>>, f64)> {
+        let underfoot = Underfoot::of_scene(self.scene)?;
+        let poses: Vec<Rigid> =
+            set_from_camera.iter().map(|pose| rigid.world_from_set.transform_pose(pose)).collect();
+        let distances = rigid.agreeing.iter().flat_map(|&agreeing| {
+            let SetCorrespondence { scene, seen_by, .. } = &candidates[agreeing];
+            let (point, poses) = (self.scene.index.position(*scene), &poses);
+            seen_by.iter().map(move |(slot, _)| (point - poses[*slot].translation).norm())
+        });
+        let depth = median(distances.collect())?;
+        let slid = |slide: &Vector3<f64>| -> Vec<Rigid> {
+            poses.iter().map(|pose| Rigid::new(pose.rotation, pose.translation + slide)).collect()
+        };
+        let (_, log10_chance) = underfoot.count_shown_elsewhere(ground, depth, |slide| {
+            self.guided(rays, slid(slide)).into_iter().flatten().collect()
+        })?;
+        let mut shown = self.guided(rays, poses);
+        for shown in &mut shown {
+            shown.retain(|found| !ground.holds(found.point));
+        }
+        Some((shown, log10_chance))
     }
 
     /// log₁₀ of the expected number of random placements of the set that explain as many features as this one.

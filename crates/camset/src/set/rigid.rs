@@ -38,13 +38,15 @@ pub(crate) struct SetPhotos<'a> {
 
 /// Finds the pose of greatest truncated score among that of the solver and, unless `params` leave them out, others.
 ///
-/// `worth` is what each correspondence counts.
+/// `worth` is what each correspondence counts. Where too few agree with any pose for a verdict, that of the best is taken for
+/// which `shown` finds most, if it finds enough for one.
 pub(crate) fn rigid_pose(
     params: &CamsetParams,
     (correspondences, worth): (&[SetCorrespondence], &[f64]),
     model: &Reconstruction,
     (rays, sights): (&SetRays, &Sights),
     photos: &SetPhotos<'_>,
+    shown: impl Fn(&Similarity) -> usize,
     seed: u64,
 ) -> Option<RigidPose> {
     let set_from_camera = photos.set_from_camera;
@@ -63,14 +65,22 @@ pub(crate) fn rigid_pose(
     }
     let bound = params.max_error_sigmas;
     let score = |pose: &Similarity| rays.score(pose, bound, worth) + sights.score(pose, bound);
-    let mut best: Option<(Similarity, f64)> = None;
-    for candidate in candidates {
-        let value = score(&candidate);
-        if best.is_none_or(|(_, least)| value > least) {
-            best = Some((candidate, value));
+    let mut scored: Vec<(Similarity, f64)> =
+        candidates.into_iter().map(|candidate| (candidate, score(&candidate))).collect();
+    scored.retain(|(_, score)| score.is_finite());
+    scored.sort_by(|one, other| other.1.total_cmp(&one.1));
+    let (mut initial, mut initial_score) = *scored.first()?;
+    let lone = Sights::worth_of_lone(sights.agreeing_lone(&initial, bound).len());
+    let support = rays.agreeing(&initial, bound, count).len() + sights.agreeing(&initial, bound).len() + lone;
+    if params.other_hypotheses && support < params.verdict.min_inliers {
+        let mut most = params.verdict.min_inliers;
+        for (pose, score) in scored.into_iter().take(WEAK_POSES) {
+            let shown = shown(&pose);
+            if shown > most {
+                (most, initial, initial_score) = (shown, pose, score);
+            }
         }
     }
-    let (initial, initial_score) = best?;
     let refined = refine_similarity(&initial, &rays.rays, params.max_error_sigmas);
     let world_from_set = if score(&refined) >= initial_score { refined } else { initial };
     let agreeing = rays.agreeing(&world_from_set, params.max_error_sigmas, count);
@@ -174,6 +184,8 @@ pub(crate) fn solver_options(params: &CamsetParams) -> GeneralizedPoseOptions {
     GeneralizedPoseOptions { solver, ..GeneralizedPoseOptions::default() }
 }
 
+/// How many poses are looked at more closely where too few correspondences agree with any.
+const WEAK_POSES: usize = 16;
 /// Samples that a single photo's pose may cost.
 const PHOTO_SAMPLES: u32 = 3000;
 /// Fewest agreeing rays that make a single photo's pose worth a hypothesis; all rays of the set judge it afterwards.
