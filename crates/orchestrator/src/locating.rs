@@ -90,7 +90,8 @@ pub fn best_answers<'a>(
 /// Locates photos; `target` is the photo that decides in [`Mode::Auto`].
 ///
 /// Where intrinsics of a set are a guess, the set is located twice: the second time with the cameras that the scene told the
-/// first time, which `folder` has afterwards. Before, guesses that do not hold are improved by a model of the photos. Photos alone keep the guess in [`Mode::Both`], which compares methods.
+/// first time, which `folder` has afterwards. Before that, guesses that do not hold are improved by a model of the photos.
+/// Photos alone keep the guess in [`Mode::Both`], which compares methods.
 ///
 /// # Errors
 /// When the run was stopped or the store cannot be written.
