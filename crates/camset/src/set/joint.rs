@@ -582,11 +582,14 @@ impl Component<'_> {
 
     /// What guided matching shows each photo of the scene, where the photos stand so.
     fn guided(&self, rays: &[PhotoRays<'_>], poses: Vec<Rigid>) -> Vec<Vec<SceneMatch>> {
-        let shown = |(slot, pose): (usize, Rigid)| {
-            let nearest = &self.evidence[self.members[slot]].nearest;
-            guided_matches(&self.params.guided, self.scene.index, &rays[slot], nearest, &pose)
-        };
+        let shown = |(slot, pose): (usize, Rigid)| self.guided_of(slot, rays, &pose);
         poses.into_par_iter().enumerate().with_max_len(1).map(shown).collect()
+    }
+
+    /// The same of one photo.
+    fn guided_of(&self, slot: usize, rays: &[PhotoRays<'_>], pose: &Rigid) -> Vec<SceneMatch> {
+        let nearest = &self.evidence[self.members[slot]].nearest;
+        guided_matches(&self.params.guided, self.scene.index, &rays[slot], nearest, pose)
     }
 
     /// What guided matching shows each photo elsewhere than on the ground, where that stands out, and log₁₀ of the chance of
@@ -659,9 +662,7 @@ impl Component<'_> {
         let shown = |scale: f64| -> usize {
             let count = |&slot: &usize| {
                 let place = center + (poses[slot].translation - center) * scale;
-                let pose = Rigid::new(poses[slot].rotation, place);
-                let nearest = &self.evidence[self.members[slot]].nearest;
-                guided_matches(&self.params.guided, self.scene.index, &rays[slot], nearest, &pose).len()
+                self.guided_of(slot, rays, &Rigid::new(poses[slot].rotation, place)).len()
             };
             away.par_iter().with_max_len(1).map(count).sum()
         };
