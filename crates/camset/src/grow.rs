@@ -333,7 +333,7 @@ mod tests {
 
     fn scene_of(grown: &GrownScene) -> Scene<'_> {
         let (reconstruction, index) = (&grown.reconstruction, &grown.index);
-        Scene { component: 0, is_placed: false, reconstruction, index, grown: &grown.grown }
+        Scene { component: 0, is_placed: false, reconstruction, index, grown: &grown.grown, doubtful: &[] }
     }
 
     #[test]

@@ -60,8 +60,9 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 26: far walls are no ground, and one standpoint contradicts a local model once.
 /// 27: what too little tells the focal length of is uncertain. 28: the ground counts for less, and what stronger pairs
 /// contradict is uncertain. 29: what guided matching shows beside the ground counts,
-/// and where hardly any match agrees, it chooses the pose.
-pub const VERSION: u32 = 29;
+/// and where hardly any match agrees, it chooses the pose. 30: photos localized alone far from where stronger ones put
+/// them, and what is seen where a scene may be folded, are uncertain.
+pub const VERSION: u32 = 30;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

@@ -9,7 +9,9 @@ mod sights;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use setloc_sfm::{CameraId, ImageId, OutvotedPair, Reconstruction, ReconstructionImage, Rigid};
+use setloc_sfm::{
+    CameraId, ImageId, OutvotedPair, Reconstruction, ReconstructionImage, Rigid, doubtful_images,
+};
 
 use crate::advice::{Link, name_open_pairs, widest_paths};
 use crate::{
@@ -180,9 +182,12 @@ fn locate_by(
         let component = Component { params, scene, photos, evidence, model, members: &members, views };
         match component.locate(seed) {
             ComponentAnswer::Localized(mut found) => {
-                for pair in local_models.outvoted.get(number).into_iter().flatten() {
+                let outvoted = local_models.outvoted.get(number).map_or(&[][..], Vec::as_slice);
+                for pair in outvoted {
                     doubt_beyond(pair, photos, evidence, &members, &mut found);
                 }
+                let doubtful = doubtful_images(model, outvoted);
+                doubt_folded(&doubtful, params.verdict.min_inliers, evidence, &members, &mut found);
                 let (component, world_from_set) = (scene.component, found.world_from_set);
                 answer.placed.push(PlacedModel { component, world_from_set });
                 let seen_by_all: Vec<_> = members.iter().copied().zip(found.scene_points.clone()).collect();
@@ -263,6 +268,28 @@ fn doubt_beyond(
         }
     }
     found.remarks.push(reason);
+}
+
+/// Makes photos uncertain about which the local model may be folded, but for those that the scene holds: localized alone at
+/// the same place, or by points of their own.
+fn doubt_folded(
+    doubtful: &[ImageId],
+    enough: usize,
+    evidence: &[&SingleLocalization],
+    members: &[usize],
+    found: &mut ComponentPoses,
+) {
+    for (slot, &photo) in members.iter().enumerate() {
+        let is_alone = evidence[photo].photo.verdict == Verdict::Localized && !found.elsewhere[slot];
+        let is_doubtful = doubtful.binary_search(&ImageId(photo as u32)).is_ok();
+        if !is_doubtful || is_alone || found.scene_points[slot] >= enough {
+            continue;
+        }
+        for photo in [&mut found.rigid[slot], &mut found.refined[slot]] {
+            photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
+            photo.reasons.push("its local model may be folded about it".to_owned());
+        }
+    }
 }
 
 /// What photos that are placed together are called, and in which component where it is not the largest.
@@ -452,39 +479,51 @@ mod tests {
         (alone, found)
     }
 
-    fn move_away(alone: &mut SingleLocalization) {
-        if let Some(pose) = &mut alone.photo.world_from_camera {
-            pose.translation.z += 8.0;
+    fn move_by(metres: f64) -> impl Fn(&mut SingleLocalization) {
+        move |alone| {
+            if let Some(pose) = &mut alone.photo.world_from_camera {
+                pose.translation.z += metres;
+            }
         }
     }
 
     #[test]
     fn a_local_model_that_several_photos_contradict_localizes_nothing() {
         let world = World::chain(9, 0.2, 1);
-        let located = |moved: usize| {
+        let located = |moved: usize, metres: f64| {
             locate_with_alone(&world, |alone| {
                 let localized = |photo: &&mut SingleLocalization| photo.photo.verdict == Verdict::Localized;
-                alone.iter_mut().filter(localized).take(moved).for_each(move_away);
+                alone.iter_mut().rev().filter(localized).take(moved).for_each(move_by(metres));
             })
         };
-        let (_, found) = located(1);
+        let (_, found) = located(1, 8.0);
         let verdicts = found.refined.iter().map(|photo| photo.verdict);
         assert_eq!(verdicts.filter(|verdict| *verdict == Verdict::Localized).count(), 8);
         assert_eq!(found.contradicted.len(), 1);
-        let (alone, found) = located(2);
-        for (photo, alone) in found.refined.iter().zip(&alone) {
-            assert_eq!(
-                photo.verdict == Verdict::Localized,
-                alone.photo.verdict == Verdict::Localized,
-                "{photo:?}"
-            );
-            if photo.verdict == Verdict::Localized {
+        // So far from where the others have them, the two of fewest matches are at a copy of what they show.
+        for (metres, outweighed) in [(3.0, 0), (8.0, 2)] {
+            let (alone, found) = located(2, metres);
+            let mut doubted = Vec::new();
+            for (photo, alone) in found.refined.iter().zip(&alone) {
+                if alone.photo.verdict != Verdict::Localized {
+                    assert_ne!(photo.verdict, Verdict::Localized, "{photo:?}");
+                    continue;
+                }
                 assert_eq!(photo.world_from_camera, alone.photo.world_from_camera);
+                if photo.verdict != Verdict::Localized {
+                    assert!(photo.reasons.join("; ").contains("with more matches"), "{photo:?}");
+                    doubted.push(photo.name.as_str());
+                }
             }
+            let localized = |alone: &&SingleLocalization| alone.photo.verdict == Verdict::Localized;
+            let names = alone.iter().rev().filter(localized).map(|alone| alone.photo.name.as_str());
+            let mut moved: Vec<&str> = names.take(outweighed).collect();
+            moved.reverse();
+            assert_eq!(doubted, moved, "moved by {metres} m");
+            assert!(found.rigid.iter().all(|photo| photo.verdict != Verdict::Localized));
+            assert!(found.contradicted.is_empty());
+            assert_ne!(found.refined[8].verdict, Verdict::Localized);
         }
-        assert!(found.rigid.iter().all(|photo| photo.verdict != Verdict::Localized));
-        assert!(found.contradicted.is_empty());
-        assert_ne!(found.refined[8].verdict, Verdict::Localized);
     }
 
     #[test]
@@ -515,6 +554,33 @@ mod tests {
     }
 
     #[test]
+    fn what_is_seen_where_the_scene_may_be_folded_is_uncertain() {
+        let world = World::chain(6, 0.2, 1);
+        let all: Vec<ImageId> = world.scene().reconstruction.registered().collect();
+        for doubtful in [&all[..1], &all[..]] {
+            let scene = Scene { doubtful, ..world.scene() };
+            let alone: Vec<_> = (world.queries().iter())
+                .map(|query| locate_single(&SingleParams::default(), &scene, query, 3))
+                .collect();
+            let references: Vec<&SingleLocalization> = alone.iter().collect();
+            let (queries, models) = (world.queries(), std::slice::from_ref(&world.local).into());
+            let no_views = || Ok::<_, Infallible>(Views::default());
+            let params = CamsetParams::default();
+            let set = locate_set(&params, &scene, &queries, &references, models, no_views, 3).unwrap();
+            let is_doubted = doubtful.len() > 1;
+            for photo in &set.refined {
+                let expected = if is_doubted { Verdict::Uncertain } else { Verdict::Localized };
+                assert_eq!(photo.verdict, expected, "{photo:?}");
+            }
+            let alone = alone.iter().map(|alone| &alone.photo);
+            for photo in alone.chain(&set.refined).filter(|photo| photo.world_from_camera.is_some()) {
+                assert_eq!(photo.reasons.join("; ").contains("may be folded"), is_doubted, "{photo:?}");
+                assert!(!is_doubted || photo.verdict == Verdict::Uncertain, "{photo:?}");
+            }
+        }
+    }
+
+    #[test]
     fn one_photo_that_contradicts_counts_once_whatever_its_standpoint_has() {
         let turned = |i: u32| {
             let center = Vector3::new(0.5, -1.5, 20.0 + 6.0 * f64::from(i / 2));
@@ -522,7 +588,7 @@ mod tests {
         };
         let world = World::new(&Place::street(3500, 11), &(0..8).map(turned).collect::<Vec<_>>(), 0.2, 11);
         let (alone, found) = locate_with_alone(&world, |alone| {
-            move_away(&mut alone[0]);
+            move_by(8.0)(&mut alone[0]);
             alone[1].photo.verdict = Verdict::Uncertain;
         });
         assert_eq!(alone[0].photo.verdict, Verdict::Localized);
@@ -738,14 +804,15 @@ mod tests {
             .map(|photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7))
             .collect();
         let evidence: Vec<&SingleLocalization> = alone.iter().collect();
-        let locate = |side: Vec<ImageId>| {
+        let locate_with = |matches: usize, side: Vec<ImageId>| {
             let (first, second) = (ImageId(5), ImageId(6));
-            let outvoted = [vec![OutvotedPair { first, second, matches: 300, held_by: 60, side }]];
+            let outvoted = [vec![OutvotedPair { first, second, matches, held_by: 60, side }]];
             let models = LocalModels { outvoted: &outvoted, ..std::slice::from_ref(&world.local).into() };
             let views = || Ok::<_, Infallible>(Views::default());
             let (params, scene) = (CamsetParams::default(), world.scene());
             locate_set(&params, &scene, &photos, &evidence, models, views, 7).unwrap()
         };
+        let locate = |side: Vec<ImageId>| locate_with(80, side);
         let verdicts = |found: &SetLocalization| -> Vec<bool> {
             found.refined.iter().map(|photo| photo.verdict == Verdict::Localized).collect()
         };
@@ -755,11 +822,15 @@ mod tests {
             let found = locate(side);
             assert_eq!(verdicts(&found), [true, true, true, true, true, true, false, false, false]);
             let reasons = &found.refined[8].reasons;
-            assert!(reasons.iter().any(|reason| reason.contains("300 matches")), "{reasons:?}");
+            assert!(reasons.iter().any(|reason| reason.contains("80 matches")), "{reasons:?}");
         }
         // Photos that are localized alone stay so on the other side.
         let by_themselves = alone.iter().filter(|found| found.photo.verdict == Verdict::Localized).count();
         assert!(by_themselves >= 2 && verdicts(&locate(first_photos(1)))[..2] == [true; 2]);
+        // By far more matches speak against those, too, that share points with them and that the scene does not hold.
+        let found = locate_with(300, first_photos(6));
+        assert_eq!(verdicts(&found), [true, true, true, true, true, false, false, false, false]);
+        assert!(found.refined[5].reasons.join("; ").contains("may be folded"));
     }
 
     fn first_photos(count: u32) -> Vec<ImageId> {

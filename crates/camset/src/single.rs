@@ -9,6 +9,7 @@ use setloc_sfm::{ImageId, Rigid};
 use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
 use crate::guided::guided_matches;
 use crate::refine::{JointModel, JointObservations, JointPhoto, refine_jointly};
+use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_precision, judge_support, weaker};
 use crate::{PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, SingleParams, Verdict};
@@ -90,6 +91,10 @@ fn locate_with_nearest(
         verdict,
         judge_precision(&params.verdict, found.covariance.as_ref(), found.depth, &mut reasons),
     );
+    if scene.is_doubtful(found.inliers.iter().map(|seen| seen.point)) {
+        reasons.push(DOUBTFUL.to_owned());
+        verdict = weaker(verdict, Verdict::Uncertain);
+    }
     let answer = PhotoLocalization {
         name: photo.name.to_owned(),
         camera: found.camera,

@@ -19,7 +19,30 @@ pub struct Scene<'a> {
     pub index: &'a SceneIndex,
     /// Which of its images are photos that it has grown by; ascending, and after all others.
     pub grown: &'a [GrownImage],
+    /// Images about which it may be folded ([`setloc_sfm::doubtful_images`]); ascending.
+    pub doubtful: &'a [ImageId],
 }
+
+impl Scene<'_> {
+    /// Whether most of these points are seen by doubtful images only.
+    pub(crate) fn is_doubtful(&self, points: impl Iterator<Item = PointId>) -> bool {
+        if self.doubtful.is_empty() {
+            return false;
+        }
+        let is_doubtful = |image: ImageId| self.doubtful.binary_search(&image).is_ok();
+        let (mut doubtful, mut all) = (0_usize, 0_usize);
+        for point in points {
+            let track = self.reconstruction.points.get(point.index()).map(|point| &point.track[..]);
+            all += 1;
+            doubtful += usize::from(track.unwrap_or_default().iter().all(|seen| is_doubtful(seen.image)));
+        }
+        2 * doubtful > all
+    }
+}
+
+/// Said of a photo that sees most of all what doubtful images of the scene see.
+pub(crate) const DOUBTFUL: &str =
+    "the scene may be folded where it is: many matches of its images contradict the model there";
 
 /// An image of the scene that is a photo localized in the scene as it was before.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

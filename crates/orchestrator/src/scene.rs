@@ -24,6 +24,8 @@ pub struct SceneFile {
     pub indices: Vec<SceneIndex>,
     /// Whether measured positions place each component in the frame of `origin`; if not, its frame is its own.
     pub placed: Vec<bool>,
+    /// Images of each component about which it may be folded; ascending.
+    pub doubtful: Vec<Vec<ImageId>>,
     /// Features of the images, by image id, as artifacts; empty where no component has registered an image. Photos that
     /// share too little with the points are matched with them ([`SceneFile::features_of`]).
     pub features: Vec<Block>,
@@ -43,7 +45,7 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 10);
+serde_artifact!(SceneFile, "scene", 11);
 
 /// Altitude of an origin where none was measured: heights are relative. A measured zero is positive.
 pub const NO_ALTITUDE: f64 = -0.0;

@@ -29,6 +29,7 @@ pub use mapper::{
 };
 pub use quality::{
     OutvotedPair, PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess,
+    doubtful_images,
 };
 pub use reconstruction::{
     AlignedTrack, BaselineLength, CameraId, ImageId, Observation, Place, PointId, Reconstruction,

@@ -1,12 +1,16 @@
 //! One component of a set: rigid pose, joint refinement with guided matching, verdicts.
 
+mod distrust;
+mod hung;
+
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use rayon::prelude::*;
 use setloc_features::{Calibration, Camera, Keypoint};
-use setloc_sfm::{BaselineLength, ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
+use setloc_sfm::{ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
 
+use self::distrust::is_distrusted;
 use super::called;
 use super::correspondences::{SetCorrespondence, correspondences, set_rays};
 use super::rigid::{RigidPose, SetPhotos, rigid_pose};
@@ -19,6 +23,7 @@ use crate::refine::{
     JointModel, JointObservations, JointPhoto, SceneView, Sighting, TiedPoint, refine_jointly,
 };
 use crate::single::{inliers, union};
+use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_precision, judge_support, weaker};
 use crate::{
@@ -35,10 +40,6 @@ const MIN_KEPT: f64 = 0.5;
 
 /// Fewest matches seen from elsewhere than the rest that give a set its scale at all.
 const MIN_FOR_SCALE: usize = 3;
-
-/// Standpoints with a photo that is localized alone elsewhere than its local model has it, from which on the model is not
-/// trusted: one may be wrong itself.
-const MIN_CONTRADICTING: usize = 2;
 
 /// Scene points that tell the focal length of a photo whose local model does not.
 const MIN_TELLING: usize = 30;
@@ -130,91 +131,8 @@ fn refuse_without_scale(photo: &mut PhotoLocalization) {
     photo.reasons.push("how far it is from the photo that sees the scene is not known".to_owned());
 }
 
-/// Local points that tie two photos.
-const MIN_TIE: usize = 8;
-
 /// Observations that a photo's six degrees of freedom can fit whatever they are.
 const POSE_OBSERVATIONS: usize = 3;
-
-/// A pair of photos whose length planes tell.
-struct Hung {
-    /// The reference, the nearer photo and the farther one.
-    slots: [usize; 3],
-    length: BaselineLength,
-    /// The photos that hang on the pair.
-    beyond: Vec<bool>,
-}
-
-impl Hung {
-    /// Moves the photos beyond the pair as one, so that the farther one stands where the pair has it.
-    fn follow(&self, poses: &mut [Rigid]) {
-        let [reference, from, to] = self.slots;
-        if !self.beyond[to] {
-            return;
-        }
-        let baseline = (poses[from].translation - poses[reference].translation).norm();
-        let Rigid { rotation, translation } = self.length.pose;
-        let moved = poses[from] * Rigid::new(rotation, translation * baseline) * poses[to].inverse();
-        for (pose, _) in poses.iter_mut().zip(&self.beyond).filter(|(_, beyond)| **beyond) {
-            *pose = moved * *pose;
-        }
-    }
-
-    /// States the covariances of those photos: what the pair leaves open beside what the nearer photo does.
-    fn state(&self, poses: &[Rigid], covariances: &mut [Option<Matrix6<f64>>]) {
-        let [reference, from, to] = self.slots;
-        if !self.beyond[to] {
-            return;
-        }
-        let (near, far) = (&poses[from], &poses[to]);
-        let baseline = near.translation - poses[reference].translation;
-        let of_far = match (covariances[reference], covariances[from]) {
-            (Some(of_reference), Some(of_near)) => {
-                let step = far.translation - near.translation;
-                let carried = carried(near, far);
-                let mut own = Matrix6::identity();
-                let world_from_near = near.rotation.to_rotation_matrix().into_inner();
-                own.fixed_view_mut::<3, 3>(3, 3).copy_from(&(world_from_near * baseline.norm()));
-                let along = baseline.normalize();
-                let center = |covariance: &Matrix6<f64>| covariance.fixed_view::<3, 3>(3, 3).into_owned();
-                let of_baseline = along.dot(&((center(&of_reference) + center(&of_near)) * along));
-                let mut sum =
-                    carried * of_near * carried.transpose() + own * self.length.covariance * own.transpose();
-                let mut of_center = sum.fixed_view_mut::<3, 3>(3, 3);
-                of_center += step * step.transpose() * (of_baseline / baseline.norm_squared());
-                Some(sum)
-            }
-            _ => None,
-        };
-        for (slot, covariance) in covariances.iter_mut().enumerate().filter(|(slot, _)| self.beyond[*slot]) {
-            let Some(of_far) = of_far else {
-                *covariance = None;
-                continue;
-            };
-            let carried = carried(far, &poses[slot]);
-            let by_pair = carried * of_far * carried.transpose();
-            // What lies between photos beyond the pair is in the adjustment's.
-            let is_elsewhere = (poses[slot].translation - far.translation).norm() > 0.0;
-            *covariance = match (is_elsewhere, *covariance) {
-                (true, Some(own)) => Some(own + by_pair),
-                (true, None) => None,
-                (false, _) => Some(by_pair),
-            };
-        }
-    }
-}
-
-/// How a small error of one pose moves another that is rigidly tied to it: 6×6, both rotations about the camera's axes,
-/// then the centres in the world.
-fn carried(from: &Rigid, to: &Rigid) -> Matrix6<f64> {
-    let [world_from_from, world_from_to] =
-        [from, to].map(|pose| pose.rotation.to_rotation_matrix().into_inner());
-    let lever = to.translation - from.translation;
-    let mut carried = Matrix6::identity();
-    carried.fixed_view_mut::<3, 3>(0, 0).copy_from(&(world_from_to.transpose() * world_from_from));
-    carried.fixed_view_mut::<3, 3>(3, 0).copy_from(&-(lever.cross_matrix() * world_from_from));
-    carried
-}
 
 impl Component<'_> {
     /// Localizes the component.
@@ -251,21 +169,10 @@ impl Component<'_> {
         };
         let mut reasons = Vec::new();
         let mut evidence = self.support(&rays, &set_from_camera, (&candidates, &worth), &sights, &rigid);
-        let is_weak = evidence.inliers < params.verdict.min_inliers;
-        if is_weak || evidence.off_ground < MIN_OFF_GROUND {
+        if evidence.inliers < params.verdict.min_inliers || evidence.off_ground < MIN_OFF_GROUND {
             let shown = self.shown_off_ground(&ground, &rays, &set_from_camera, &candidates, &rigid);
-            if let Some((shown, log10_chance)) = shown {
-                let count = shown.iter().map(Vec::len).sum();
-                evidence.off_ground = evidence.off_ground.max(count);
-                if is_weak {
-                    let of_photo = |(shown, rays): (&Vec<SceneMatch>, &PhotoRays<'_>)| {
-                        occupied_cells(rays, shown.iter().map(|found| found.feature))
-                    };
-                    evidence.cells = shown.iter().zip(&rays).map(of_photo).fold(evidence.cells, usize::max);
-                    evidence.shown = count;
-                    evidence.log10_false_alarms = evidence.log10_false_alarms.min(log10_chance);
-                    evidence.runner_up_share = rigid.runner_up_worth / (evidence.inliers + count) as f64;
-                }
+            if let Some(shown) = shown {
+                self.add_shown(&mut evidence, &rays, &rigid, shown);
             }
         }
         if evidence.inliers.max(evidence.shown) < params.verdict.min_inliers {
@@ -291,12 +198,14 @@ impl Component<'_> {
             reasons.push(format!("its scale rests on {elsewhere} matches seen from elsewhere than the rest"));
             support = weaker(support, Verdict::Uncertain);
         }
+        let supporting = rigid.agreeing.iter().map(|&number| candidates[number].scene);
+        if self.scene.is_doubtful(supporting.chain(joint.direct.iter().flatten().map(|seen| seen.point))) {
+            reasons.push(DOUBTFUL.to_owned());
+            support = weaker(support, Verdict::Uncertain);
+        }
         let (mut refined, mut elsewhere_alone) =
             self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
-        let contradicted: BTreeSet<usize> = (joint.model.photos.iter().zip(&elsewhere_alone))
-            .filter_map(|(photo, elsewhere)| elsewhere.then_some(photo.standpoint))
-            .collect();
-        let is_distrusted = contradicted.len() >= MIN_CONTRADICTING;
+        let is_distrusted = is_distrusted(&joint.model.photos, &elsewhere_alone);
         let mut without_scale = Vec::new();
         if has_scale
             && elsewhere.max(joint.seen_from_elsewhere()).max(joint.viewed_from_elsewhere) < MIN_FOR_SCALE
@@ -329,7 +238,9 @@ impl Component<'_> {
             refuse_without_scale(&mut rigid_answers[slot]);
         }
         if is_distrusted {
-            remarks.push(self.distrust(&mut refined, &mut rigid_answers, &mut elsewhere_alone));
+            let is_outweighed = self.outweighed(&joint);
+            let alone = (&mut elsewhere_alone[..], &is_outweighed[..]);
+            remarks.push(self.distrust(&mut refined, &mut rigid_answers, alone));
         }
         ComponentAnswer::Localized(Box::new(ComponentPoses {
             world_from_set: rigid.world_from_set,
@@ -347,109 +258,6 @@ impl Component<'_> {
             refined,
             remarks,
         }))
-    }
-
-    /// Takes the photos' own word where several contradict the local model: it is bent, or two places are one in it, and then
-    /// no other pose that rests on it is sure. Says which they are.
-    fn distrust(
-        &self,
-        refined: &mut [PhotoLocalization],
-        rigid: &mut [PhotoLocalization],
-        elsewhere: &mut [bool],
-    ) -> String {
-        let contradicting: Vec<&str> = (refined.iter().zip(elsewhere.iter()))
-            .filter(|(_, elsewhere)| **elsewhere)
-            .map(|(photo, _)| photo.name.as_str())
-            .collect();
-        let reason =
-            format!("its local model is contradicted by {}, localized alone", contradicting.join(", "));
-        for (slot, photo) in refined.iter_mut().enumerate() {
-            let alone = &self.evidence[self.members[slot]].photo;
-            if alone.verdict == Verdict::Localized {
-                photo.clone_from(alone);
-            } else {
-                photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
-            }
-            photo.reasons.push(reason.clone());
-        }
-        for photo in rigid {
-            photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
-        }
-        elsewhere.fill(false);
-        reason
-    }
-
-    /// Lengths of baselines that the local points do not tell, and the slots that they lie between.
-    fn lengths(&self) -> impl Iterator<Item = ([usize; 3], BaselineLength)> + '_ {
-        let slot_of = |image: ImageId| self.members.binary_search(&image.index()).ok();
-        self.model.lengths.iter().filter_map(move |&length| {
-            let (images, _) = length.held();
-            let [reference, from, to] = images.map(slot_of);
-            Some(([reference?, from?, to?], length))
-        })
-    }
-
-    /// The pairs whose length planes tell, and the photos that hang on each.
-    fn hung(&self, poses: &[Rigid]) -> Vec<Hung> {
-        let standpoints: Vec<usize> = (0..poses.len()).map(|slot| standpoint(poses, slot)).collect();
-        let hung = |(slots, length)| Hung { slots, length, beyond: self.beyond(&standpoints, slots) };
-        self.lengths().map(hung).collect()
-    }
-
-    /// Puts the photos that hang on a pair whose length planes tell where that pair has them, and states what it leaves
-    /// open.
-    ///
-    /// The points that the pair shares lie on little more than one wall, which adjusted as free points fits many
-    /// directions. Where the scene holds any of these photos, the adjustment stands.
-    fn follow_pairs(&self, joint: &mut Joint) {
-        let mut poses: Vec<Rigid> = joint.model.photos.iter().map(|photo| photo.world_from_camera).collect();
-        for hung in self.hung(&poses) {
-            let held = |slot: &usize| joint.direct[*slot].len() >= self.params.verdict.min_inliers;
-            if (0..poses.len()).filter(|&slot| hung.beyond[slot]).any(|slot| held(&slot)) {
-                continue;
-            }
-            hung.follow(&mut poses);
-            hung.state(&poses, &mut joint.covariances);
-        }
-        for (photo, pose) in joint.model.photos.iter_mut().zip(poses) {
-            photo.world_from_camera = pose;
-        }
-    }
-
-    /// The photos that no common points tie to the reference but through the pair.
-    fn beyond(&self, standpoints: &[usize], slots: [usize; 3]) -> Vec<bool> {
-        let mut shared = vec![vec![0_usize; standpoints.len()]; standpoints.len()];
-        for local in 0..self.model.points.len() {
-            let track = self.track(local);
-            for &(a, _) in &track {
-                for &(b, _) in &track {
-                    shared[standpoints[a]][standpoints[b]] += 1;
-                }
-            }
-        }
-        let [reference, from, to] = slots.map(|slot| standpoints[slot]);
-        let mut reached = vec![false; standpoints.len()];
-        let mut waiting = vec![reference];
-        while let Some(at) = waiting.pop() {
-            if std::mem::replace(&mut reached[at], true) {
-                continue;
-            }
-            let is_pair = |other: usize| (at == from && other == to) || (at == to && other == from);
-            waiting.extend(
-                (0..standpoints.len()).filter(|&other| shared[at][other] >= MIN_TIE && !is_pair(other)),
-            );
-        }
-        standpoints.iter().map(|&standpoint| !reached[standpoint]).collect()
-    }
-
-    /// What such a length rests on, in words.
-    fn basis(&self, [_, from, to]: [usize; 3], length: &BaselineLength) -> String {
-        let [from, to] = [from, to].map(|slot| self.photos[self.members[slot]].name);
-        format!(
-            "the distance of {to} from {from} rests on planes that go on or the ground ({} points, ± {:.0} %), not on common points",
-            length.votes,
-            100.0 * length.deviation
-        )
     }
 
     fn camera_of(&self, slot: usize) -> usize {
@@ -622,6 +430,28 @@ impl Component<'_> {
             shown.retain(|found| !ground.holds(found.point));
         }
         Some((shown, log10_chance))
+    }
+
+    /// Counts that as evidence: off the ground in any case, in place of matches where hardly any agree.
+    fn add_shown(
+        &self,
+        evidence: &mut Evidence,
+        rays: &[PhotoRays<'_>],
+        rigid: &RigidPose,
+        (shown, log10_chance): (Vec<Vec<SceneMatch>>, f64),
+    ) {
+        let count = shown.iter().map(Vec::len).sum();
+        evidence.off_ground = evidence.off_ground.max(count);
+        if evidence.inliers >= self.params.verdict.min_inliers {
+            return;
+        }
+        let of_photo = |(shown, rays): (&Vec<SceneMatch>, &PhotoRays<'_>)| {
+            occupied_cells(rays, shown.iter().map(|found| found.feature))
+        };
+        evidence.cells = shown.iter().zip(rays).map(of_photo).fold(evidence.cells, usize::max);
+        evidence.shown = count;
+        evidence.log10_false_alarms = evidence.log10_false_alarms.min(log10_chance);
+        evidence.runner_up_share = rigid.runner_up_worth / (evidence.inliers + count) as f64;
     }
 
     /// log₁₀ of the expected number of random placements of the set that explain as many features as this one.

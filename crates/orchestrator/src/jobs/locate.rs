@@ -172,6 +172,7 @@ pub(super) fn components_of<'a>(scene: &'a SceneFile, empty: &'a EmptyScene) -> 
         index,
         // Only the largest grows.
         grown: if component == 0 { &scene.grown } else { &[] },
+        doubtful: scene.doubtful.get(component).map_or(&[], Vec::as_slice),
     };
     let mut components: Vec<Scene<'a>> =
         scene.components.iter().zip(&scene.indices).enumerate().map(component).collect();

@@ -5,7 +5,10 @@ use rayon::prelude::*;
 use serde_json::json;
 use setloc_features::{GeoPosition, ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::{ImageId, MapperOutput, MeasuredPosition, MergeRecord, Reconstruction, ReconstructionImage};
+use setloc_sfm::{
+    ImageId, MapperOutput, MeasuredPosition, MergeRecord, Reconstruction, ReconstructionImage,
+    doubtful_images,
+};
 
 use super::choose_pairs;
 use super::model::{
@@ -150,7 +153,12 @@ pub fn add_scene(
         let output = inputs.get::<MapperOutput>("model")?;
         let indices = inputs.get::<SceneIndices>("index")?;
         let ((components, copy), features) = rayon::join(
-            || (output.components.iter().map(|model| named(model, &names)).collect(), indices.0.clone()),
+            || {
+                (
+                    output.components.iter().map(|model| named(model, &names)).collect::<Vec<_>>(),
+                    indices.0.clone(),
+                )
+            },
             || features_of_registered(inputs, &output),
         );
         let features = features?;
@@ -168,13 +176,23 @@ pub fn add_scene(
         let relative = origin.filter(|origin| !has_altitude(*origin)).map(|_| {
             "the measured positions have no altitudes: heights are relative, and left out where WGS84 is told".to_owned()
         });
+        let doubtful: Vec<Vec<ImageId>> = (output.components.iter().zip(&output.outvoted))
+            .map(|(component, outvoted)| doubtful_images(component, outvoted))
+            .collect();
+        let doubts: Vec<String> = components
+            .iter()
+            .zip(&doubtful)
+            .filter_map(|(component, images)| doubt(component, images))
+            .collect();
         Product::new(SceneFile {
             components,
             indices: copy,
+            doubtful,
             placed: georegistrations().map(|is_placed| is_placed && origin.is_some()).collect(),
             features,
             origin,
             warnings: (output.report.warnings.iter().map(|text| with_names(text, &names)))
+                .chain(doubts)
                 .chain(recall.as_ref().filter(|recall| recall.share < MIN_RECALL).map(Recall::warning))
                 .chain(fixes.as_deref().and_then(positions::warning))
                 .collect(),
@@ -208,6 +226,14 @@ pub fn add_scene(
         features[at] = job;
     }
     Ok(SceneJobs { features, model: jobs.model, scene })
+}
+
+/// Says what images about which a model may be folded mean for photos.
+fn doubt(component: &Reconstruction, images: &[ImageId]) -> Option<String> {
+    let names: Vec<&str> = images.iter().map(|image| component.images[image.index()].name.as_str()).collect();
+    (!names.is_empty()).then(|| {
+        format!("photos of what {} show will be uncertain: the model may be folded there", names.join(", "))
+    })
 }
 
 /// The measured images of the largest component, where they place it.
