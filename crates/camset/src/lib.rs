@@ -61,8 +61,9 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 27: what too little tells the focal length of is uncertain. 28: the ground counts for less, and what stronger pairs
 /// contradict is uncertain. 29: what guided matching shows beside the ground counts,
 /// and where hardly any match agrees, it chooses the pose. 30: photos localized alone far from where stronger ones put
-/// them, and what is seen where a scene may be folded, are uncertain.
-pub const VERSION: u32 = 30;
+/// them, and what is seen where a scene may be folded, are uncertain. 31: where a set's photos have many cameras, those
+/// that share one have focal lengths of their own.
+pub const VERSION: u32 = 31;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

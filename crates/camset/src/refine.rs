@@ -26,10 +26,37 @@ pub(crate) struct JointModel {
     pub cameras: Vec<Camera>,
     /// Whether each camera's intrinsics are known.
     pub camera_fixed: Vec<bool>,
+    /// The camera that each is alike, where images were found to have cameras that differ by little.
+    pub camera_alike: Vec<Option<Camera>>,
     pub photos: Vec<JointPhoto>,
     pub points: Vec<Vector3<f64>>,
     /// Lengths of baselines that the points do not tell, between slots of photos.
     pub lengths: Vec<([usize; 3], LengthRatio)>,
+}
+
+impl JointModel {
+    /// Gives photos that share a camera which is not known one each, alike the one that they have.
+    pub fn give_own_cameras(&mut self) {
+        let shared = self.cameras.len();
+        self.camera_alike = vec![None; shared];
+        let mut photos_of = vec![0_usize; shared];
+        for photo in &self.photos {
+            photos_of[photo.camera] += 1;
+        }
+        for photo in &mut self.photos {
+            if photos_of[photo.camera] > 1 && !self.camera_fixed[photo.camera] {
+                let camera = self.cameras[photo.camera].clone();
+                photo.camera = self.cameras.len();
+                self.camera_alike.push(Some(camera.clone()));
+                self.cameras.push(camera);
+                self.camera_fixed.push(false);
+            }
+        }
+        // Those that no photo has any more are nothing to estimate.
+        for (fixed, photos) in self.camera_fixed.iter_mut().zip(photos_of) {
+            *fixed |= photos > 1;
+        }
+    }
 }
 
 /// One photo of a joint model.
@@ -114,8 +141,11 @@ pub(crate) fn refine_jointly(
     let Builder { points, mut observations, mut origins, seen, priors, .. } = builder;
     let freedom = |&fixed: &bool| if fixed { IntrinsicsFreedom::FIXED } else { IntrinsicsFreedom::FREE };
     let camera_freedom: Vec<IntrinsicsFreedom> = model.camera_fixed.iter().map(freedom).collect();
-    let usual = |(at, camera): (usize, &Camera)| CameraPrior::of_usual_photo(at as u32, camera);
-    let camera_priors: Vec<CameraPrior> = model.cameras.iter().enumerate().filter_map(usual).collect();
+    let prior = |(at, camera): (usize, &Camera)| match model.camera_alike.get(at) {
+        Some(Some(alike)) => CameraPrior::alike(at as u32, alike),
+        _ => CameraPrior::of_usual_photo(at as u32, camera),
+    };
+    let camera_priors: Vec<CameraPrior> = model.cameras.iter().enumerate().filter_map(prior).collect();
     let mut poses: Vec<BundlePose> = model
         .photos
         .iter()
@@ -521,6 +551,7 @@ mod tests {
         let mut model = JointModel {
             cameras: vec![world.camera.clone()],
             camera_fixed: vec![true],
+            camera_alike: Vec::new(),
             photos: vec![JointPhoto { camera: 0, world_from_camera: off, standpoint: 0 }],
             points: Vec::new(),
             lengths: Vec::new(),
@@ -535,6 +566,32 @@ mod tests {
     }
 
     #[test]
+    fn photos_that_share_an_unknown_camera_get_focal_lengths_of_their_own() {
+        let world = World::chain(1, 0.0, 33);
+        let camera = |focal: f64| world.camera.with_focal_times(focal / world.camera.focal_length());
+        let photo =
+            |camera: usize| JointPhoto { camera, world_from_camera: Rigid::identity(), standpoint: 0 };
+        let mut model = JointModel {
+            cameras: [700.0, 800.0, 900.0].map(camera).to_vec(),
+            camera_fixed: vec![true, false, false],
+            camera_alike: Vec::new(),
+            photos: [0, 1, 0, 1, 2].map(photo).to_vec(),
+            points: Vec::new(),
+            lengths: Vec::new(),
+        };
+        model.give_own_cameras();
+        assert_eq!(model.photos.iter().map(|photo| photo.camera).collect::<Vec<_>>(), [0, 3, 0, 4, 2]);
+        assert_eq!(model.camera_fixed, [true, true, false, false, false]);
+        let alike: Vec<Option<f64>> =
+            model.camera_alike.iter().map(|alike| Some(alike.as_ref()?.focal_length())).collect();
+        assert_eq!(alike, [None, None, None, Some(800.0), Some(800.0)]);
+        let prior = CameraPrior::alike(3, &model.cameras[3]).unwrap();
+        let usual = CameraPrior::of_usual_photo(3, &model.cameras[3]).unwrap();
+        assert_eq!((prior.parameters[0].value, prior.parameters[0].sigma), (800.0, 8.0));
+        assert_eq!(prior.parameters[2..], usual.parameters[2..]);
+    }
+
+    #[test]
     fn one_match_far_astray_does_not_stand_for_the_noise_of_all() {
         let trace = |off_px: f32| {
             let mut world = World::chain(1, 0.0, 32);
@@ -545,6 +602,7 @@ mod tests {
             let mut model = JointModel {
                 cameras: vec![world.camera.clone()],
                 camera_fixed: vec![true],
+                camera_alike: Vec::new(),
                 photos: vec![JointPhoto { camera: 0, world_from_camera: view.pose, standpoint: 0 }],
                 points: Vec::new(),
                 lengths: Vec::new(),

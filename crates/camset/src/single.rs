@@ -204,6 +204,7 @@ fn fit(
         let mut model = JointModel {
             cameras: vec![camera],
             camera_fixed: vec![photo.calibration.is_settled()],
+            camera_alike: Vec::new(),
             photos: vec![JointPhoto { camera: 0, world_from_camera: pose, standpoint: 0 }],
             points: Vec::new(),
             lengths: Vec::new(),

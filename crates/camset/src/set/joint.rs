@@ -41,6 +41,10 @@ const MIN_KEPT: f64 = 0.5;
 /// Fewest matches seen from elsewhere than the rest that give a set its scale at all.
 const MIN_FOR_SCALE: usize = 3;
 
+/// Cameras from which on photos may have zooms of any focal length, and the photos to each that speak for fewer.
+const MANY_CAMERAS: usize = 4;
+const MANY_PHOTOS: usize = 3;
+
 /// Scene points that tell the focal length of a photo whose local model does not.
 const MIN_TELLING: usize = 30;
 
@@ -102,6 +106,10 @@ struct Joint {
 }
 
 impl Joint {
+    fn camera_of(&self, slot: usize) -> &Camera {
+        &self.model.cameras[self.model.photos[slot].camera]
+    }
+
     /// The standpoint whose photos see most of the scene.
     fn main_standpoint(&self) -> usize {
         let mut seen = vec![0_usize; self.direct.len()];
@@ -138,7 +146,7 @@ impl Component<'_> {
     /// Localizes the component.
     pub(crate) fn locate(&self, seed: u64) -> ComponentAnswer {
         let params = self.params;
-        let rays = self.rays(&self.model.cameras);
+        let rays = self.rays(&self.model.cameras, |slot| self.camera_of(slot));
         let mut set_from_camera: Vec<Rigid> = self
             .members
             .iter()
@@ -264,13 +272,15 @@ impl Component<'_> {
         self.model.images[self.members[slot]].camera.index()
     }
 
-    fn rays<'c>(&'c self, cameras: &'c [Camera]) -> Vec<PhotoRays<'c>> {
+    fn rays<'c>(
+        &'c self,
+        cameras: &'c [Camera],
+        camera_of: impl Fn(usize) -> usize + Sync,
+    ) -> Vec<PhotoRays<'c>> {
         (0..self.members.len())
             .into_par_iter()
             .with_max_len(1)
-            .map(|slot| {
-                PhotoRays::new(self.photos[self.members[slot]].features, &cameras[self.camera_of(slot)])
-            })
+            .map(|slot| PhotoRays::new(self.photos[self.members[slot]].features, &cameras[camera_of(slot)]))
             .collect()
     }
 
@@ -464,7 +474,7 @@ impl Component<'_> {
         let (mut features, mut explained, mut chance) = (0, 0, 0.0);
         for (slot, direct) in joint.direct.iter().enumerate() {
             let count = self.photos[self.members[slot]].features.len();
-            let camera = &joint.model.cameras[self.camera_of(slot)];
+            let camera = joint.camera_of(slot);
             let radius_share = std::f64::consts::PI * self.params.guided.radius_px.powi(2)
                 / (f64::from(camera.width) * f64::from(camera.height)).max(1.0);
             features += count;
@@ -513,6 +523,7 @@ impl Component<'_> {
         let mut model = JointModel {
             cameras: self.model.cameras.clone(),
             camera_fixed: self.fixed_cameras(),
+            camera_alike: Vec::new(),
             photos: set_from_camera
                 .iter()
                 .enumerate()
@@ -530,10 +541,14 @@ impl Component<'_> {
                 .collect(),
             lengths: self.lengths().map(|(slots, length)| (slots, length.held().1)).collect(),
         };
+        if are_many(&self.open_cameras()) {
+            model.give_own_cameras();
+        }
         let mut covariances = Vec::new();
         for round in 0..=self.params.rounds {
             let cameras = model.cameras.clone();
-            let rays = self.rays(&cameras);
+            let camera_of: Vec<usize> = model.photos.iter().map(|photo| photo.camera).collect();
+            let rays = self.rays(&cameras, |slot| camera_of[slot]);
             let mut observations = if round == 0 {
                 self.rigid_observations(candidates, rigid)
             } else {
@@ -550,7 +565,7 @@ impl Component<'_> {
             covariances = refine_jointly(&mut model, self.scene, &rays, &observations, last);
             model.points.truncate(local_points);
         }
-        let rays = self.rays(&model.cameras);
+        let rays = self.rays(&model.cameras, |slot| model.photos[slot].camera);
         let direct = self.observations(&model, &rays, candidates, world_from_set, 1.0).direct;
         let agreeing = self.agreeing_sights(sights, &model);
         let mut viewed = vec![0; self.members.len()];
@@ -615,6 +630,12 @@ impl Component<'_> {
             sight.error_sigmas_of(&model.points[sight.local]) < self.params.max_error_sigmas
         };
         (0..sights.all.len()).filter(agrees).collect()
+    }
+
+    /// The cameras of the photos whose cameras are not known.
+    fn open_cameras(&self) -> Vec<usize> {
+        let fixed = self.fixed_cameras();
+        (0..self.members.len()).map(|slot| self.camera_of(slot)).filter(|&camera| !fixed[camera]).collect()
     }
 
     /// A camera is known when all photos that share it say so.
@@ -899,7 +920,7 @@ impl Component<'_> {
                 let verdict = weaker(verdict, precision);
                 let answer = PhotoLocalization {
                     name: self.photos[photo].name.to_owned(),
-                    camera: joint.model.cameras[self.camera_of(slot)].clone(),
+                    camera: joint.camera_of(slot).clone(),
                     component: self.scene.component,
                     world_from_camera: Some(pose),
                     covariance,
@@ -957,6 +978,13 @@ impl Component<'_> {
             })
             .unwrap_or(0.0)
     }
+}
+
+/// Whether photos of these cameras have so many that hardly two have one: a zoom has any focal length, and those that are
+/// not told apart need not be one.
+fn are_many(of_photos: &[usize]) -> bool {
+    let cameras = of_photos.iter().collect::<BTreeSet<_>>().len();
+    cameras >= MANY_CAMERAS && of_photos.len() < MANY_PHOTOS * cameras
 }
 
 /// Those of some sights whose local points are free.
@@ -1027,6 +1055,13 @@ mod tests {
     use setloc_sfm::PointId;
 
     use super::*;
+
+    #[test]
+    fn cameras_are_many_where_hardly_two_photos_have_one() {
+        assert!(are_many(&[0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2]));
+        assert!(!are_many(&[0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3]));
+        assert!(!are_many(&[0, 1, 2, 0]) && !are_many(&[]));
+    }
 
     #[test]
     fn matches_of_one_standpoint_say_nothing_of_scale() {

@@ -110,6 +110,9 @@ pub struct CameraPrior {
 /// Scale of the loss on what holds for the usual photo, in standard deviations.
 const UNUSUAL: f64 = 2.0;
 
+/// Deviation of focal lengths that are not told apart, as a share.
+const ALIKE_FOCAL: f64 = 0.01;
+
 impl CameraPrior {
     /// What holds for the usual photo, as standard deviations: the principal point lies within 0.5 % of the longer side of
     /// the image's centre, the first radial coefficient is within 0.2, further ones within 0.05, tangential ones within
@@ -136,6 +139,18 @@ impl CameraPrior {
         };
         let parameters = camera.param_roles().iter().zip(camera.model.param_names()).map(known).collect();
         Some(Self { camera: index, parameters, aspect_sigma: 0.001, loss: RobustLoss::Cauchy(UNUSUAL) })
+    }
+
+    /// What holds for the usual photo, and that the focal length is within 1 % of this camera's.
+    pub fn alike(index: u32, camera: &Camera) -> Option<Self> {
+        let mut prior = Self::of_usual_photo(index, camera)?;
+        let focal = camera.param_roles().iter().zip(&camera.params);
+        for (known, (_, &value)) in
+            prior.parameters.iter_mut().zip(focal).filter(|(_, (role, _))| **role == ParamRole::Focal)
+        {
+            *known = ParameterEstimate { value, sigma: ALIKE_FOCAL * value };
+        }
+        Some(prior)
     }
 
     /// Whether it is one of this camera, in numbers that can be weighed.
