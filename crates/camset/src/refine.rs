@@ -20,41 +20,88 @@ use crate::{Scene, SceneMatch};
 /// inlier still) a seventeenth, so leftovers among the matches hardly pull.
 const LOSS_SCALE: f64 = 1.0;
 
+/// Cameras from which on photos may have zooms of any focal length, and the photos to each that speak for fewer.
+const MANY_CAMERAS: usize = 4;
+const MANY_PHOTOS: usize = 3;
+
 /// Photos, their cameras and the local points between them, all in the scene's frame.
 #[derive(Debug, Clone)]
 pub(crate) struct JointModel {
-    pub cameras: Vec<Camera>,
-    /// Whether each camera's intrinsics are known.
-    pub camera_fixed: Vec<bool>,
-    /// The camera that each is alike, where images were found to have cameras that differ by little.
-    pub camera_alike: Vec<Option<Camera>>,
+    pub cameras: Vec<JointCamera>,
     pub photos: Vec<JointPhoto>,
     pub points: Vec<Vector3<f64>>,
     /// Lengths of baselines that the points do not tell, between slots of photos.
     pub lengths: Vec<([usize; 3], LengthRatio)>,
 }
 
-impl JointModel {
-    /// Gives photos that share a camera which is not known one each, alike the one that they have.
-    pub fn give_own_cameras(&mut self) {
-        let shared = self.cameras.len();
-        self.camera_alike = vec![None; shared];
-        let mut photos_of = vec![0_usize; shared];
-        for photo in &self.photos {
-            photos_of[photo.camera] += 1;
+/// A camera of a joint model.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct JointCamera {
+    pub camera: Camera,
+    pub known: KnownOfCamera,
+}
+
+/// What is known of a camera beside what the adjustment finds.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum KnownOfCamera {
+    /// Its intrinsics: they stay.
+    Intrinsics,
+    /// Nothing but what holds for usual photos.
+    Usual,
+    /// That it differs from this one by little.
+    Alike(Camera),
+}
+
+impl JointCamera {
+    pub fn new(camera: Camera, is_known: bool) -> Self {
+        Self { camera, known: if is_known { KnownOfCamera::Intrinsics } else { KnownOfCamera::Usual } }
+    }
+
+    fn freedom(&self) -> IntrinsicsFreedom {
+        match self.known {
+            KnownOfCamera::Intrinsics => IntrinsicsFreedom::FIXED,
+            KnownOfCamera::Usual | KnownOfCamera::Alike(_) => IntrinsicsFreedom::FREE,
         }
-        for photo in &mut self.photos {
-            if photos_of[photo.camera] > 1 && !self.camera_fixed[photo.camera] {
-                let camera = self.cameras[photo.camera].clone();
-                photo.camera = self.cameras.len();
-                self.camera_alike.push(Some(camera.clone()));
-                self.cameras.push(camera);
-                self.camera_fixed.push(false);
+    }
+
+    /// `None` for panoramas, which have nothing to estimate.
+    fn prior(&self, index: u32) -> Option<CameraPrior> {
+        match &self.known {
+            KnownOfCamera::Alike(alike) => CameraPrior::alike(index, alike),
+            KnownOfCamera::Intrinsics | KnownOfCamera::Usual => {
+                CameraPrior::of_usual_photo(index, &self.camera)
             }
         }
-        // Those that no photo has any more are nothing to estimate.
-        for (fixed, photos) in self.camera_fixed.iter_mut().zip(photos_of) {
-            *fixed |= photos > 1;
+    }
+}
+
+impl JointModel {
+    pub fn camera_of(&self, slot: usize) -> &Camera {
+        &self.cameras[self.photos[slot].camera].camera
+    }
+
+    /// Gives photos that share a camera which is not known one each, alike the one that they have, where hardly two photos have
+    /// one: a zoom has any focal length, and those that are not told apart need not be one.
+    pub fn give_own_cameras_where_many(&mut self) {
+        let mut photos_of: BTreeMap<usize, usize> = BTreeMap::new();
+        for photo in &self.photos {
+            if self.cameras[photo.camera].known == KnownOfCamera::Usual {
+                *photos_of.entry(photo.camera).or_default() += 1;
+            }
+        }
+        let photos: usize = photos_of.values().sum();
+        if photos_of.len() < MANY_CAMERAS || photos >= MANY_PHOTOS * photos_of.len() {
+            return;
+        }
+        photos_of.retain(|_, photos| *photos > 1);
+        for photo in self.photos.iter_mut().filter(|photo| photos_of.contains_key(&photo.camera)) {
+            let camera = self.cameras[photo.camera].camera.clone();
+            photo.camera = self.cameras.len();
+            self.cameras.push(JointCamera { known: KnownOfCamera::Alike(camera.clone()), camera });
+        }
+        // No photo has them any more: nothing to estimate.
+        for camera in photos_of.into_keys() {
+            self.cameras[camera].known = KnownOfCamera::Intrinsics;
         }
     }
 }
@@ -139,13 +186,9 @@ pub(crate) fn refine_jointly(
     };
     builder.add_all(scene.index, observed);
     let Builder { points, mut observations, mut origins, seen, priors, .. } = builder;
-    let freedom = |&fixed: &bool| if fixed { IntrinsicsFreedom::FIXED } else { IntrinsicsFreedom::FREE };
-    let camera_freedom: Vec<IntrinsicsFreedom> = model.camera_fixed.iter().map(freedom).collect();
-    let prior = |(at, camera): (usize, &Camera)| match model.camera_alike.get(at) {
-        Some(Some(alike)) => CameraPrior::alike(at as u32, alike),
-        _ => CameraPrior::of_usual_photo(at as u32, camera),
-    };
-    let camera_priors: Vec<CameraPrior> = model.cameras.iter().enumerate().filter_map(prior).collect();
+    let camera_freedom = model.cameras.iter().map(JointCamera::freedom).collect();
+    let prior = |(at, camera): (usize, &JointCamera)| camera.prior(at as u32);
+    let camera_priors = model.cameras.iter().enumerate().filter_map(prior).collect();
     let mut poses: Vec<BundlePose> = model
         .photos
         .iter()
@@ -157,7 +200,7 @@ pub(crate) fn refine_jointly(
             fixed: seen < 3,
         })
         .collect();
-    let mut cameras = model.cameras.clone();
+    let mut cameras: Vec<Camera> = model.cameras.iter().map(|known| known.camera.clone()).collect();
     cameras.push(sphere());
     let mut common = CommonErrors::default();
     for &ScenePrior { point, scene_point, ref covariance } in &priors {
@@ -221,7 +264,7 @@ pub(crate) fn refine_jointly(
             *covariance = covariance.map(|own| own + common);
         }
     }
-    for (camera, refined) in model.cameras.iter_mut().zip(&problem.cameras) {
+    for (JointCamera { camera, .. }, refined) in model.cameras.iter_mut().zip(&problem.cameras) {
         camera.clone_from(refined);
     }
     for (slot, photo) in model.photos.iter_mut().enumerate() {
@@ -549,9 +592,7 @@ mod tests {
         let mut off = view.pose;
         off.translation += Vector3::new(0.3, -0.1, 0.2);
         let mut model = JointModel {
-            cameras: vec![world.camera.clone()],
-            camera_fixed: vec![true],
-            camera_alike: Vec::new(),
+            cameras: vec![JointCamera::new(world.camera.clone(), true)],
             photos: vec![JointPhoto { camera: 0, world_from_camera: off, standpoint: 0 }],
             points: Vec::new(),
             lengths: Vec::new(),
@@ -566,29 +607,41 @@ mod tests {
     }
 
     #[test]
-    fn photos_that_share_an_unknown_camera_get_focal_lengths_of_their_own() {
+    fn photos_of_many_unknown_cameras_get_focal_lengths_of_their_own() {
         let world = World::chain(1, 0.0, 33);
+        let focal_lengths = [700.0, 800.0, 900.0, 1000.0, 1100.0];
         let camera = |focal: f64| world.camera.with_focal_times(focal / world.camera.focal_length());
-        let photo =
-            |camera: usize| JointPhoto { camera, world_from_camera: Rigid::identity(), standpoint: 0 };
-        let mut model = JointModel {
-            cameras: [700.0, 800.0, 900.0].map(camera).to_vec(),
-            camera_fixed: vec![true, false, false],
-            camera_alike: Vec::new(),
-            photos: [0, 1, 0, 1, 2].map(photo).to_vec(),
-            points: Vec::new(),
-            lengths: Vec::new(),
+        let of_photos = |cameras: &[usize]| {
+            let photo =
+                |&camera: &usize| JointPhoto { camera, world_from_camera: Rigid::identity(), standpoint: 0 };
+            let known = |(at, focal)| JointCamera::new(camera(focal), at == 0);
+            let mut model = JointModel {
+                cameras: focal_lengths.into_iter().enumerate().map(known).collect(),
+                photos: cameras.iter().map(photo).collect(),
+                points: Vec::new(),
+                lengths: Vec::new(),
+            };
+            model.give_own_cameras_where_many();
+            (model.photos.iter().map(|photo| photo.camera).collect::<Vec<_>>(), model.cameras)
         };
-        model.give_own_cameras();
-        assert_eq!(model.photos.iter().map(|photo| photo.camera).collect::<Vec<_>>(), [0, 3, 0, 4, 2]);
-        assert_eq!(model.camera_fixed, [true, true, false, false, false]);
-        let alike: Vec<Option<f64>> =
-            model.camera_alike.iter().map(|alike| Some(alike.as_ref()?.focal_length())).collect();
-        assert_eq!(alike, [None, None, None, Some(800.0), Some(800.0)]);
-        let prior = CameraPrior::alike(3, &model.cameras[3]).unwrap();
-        let usual = CameraPrior::of_usual_photo(3, &model.cameras[3]).unwrap();
+        let (photos, cameras) = of_photos(&[0, 1, 0, 2, 3, 4, 1]);
+        assert_eq!(photos, [0, 5, 0, 2, 3, 4, 6]);
+        let known: Vec<KnownOfCamera> = cameras.iter().map(|camera| camera.known.clone()).collect();
+        let alike = || KnownOfCamera::Alike(camera(800.0));
+        let (intrinsics, usual) = (KnownOfCamera::Intrinsics, KnownOfCamera::Usual);
+        let (own, none) = ([alike(), alike()], [intrinsics.clone(), intrinsics]);
+        assert_eq!(known, [&none[..], &[usual.clone(), usual.clone(), usual], &own].concat());
+        assert_eq!(cameras[6].camera, camera(800.0));
+        let (prior, usual) =
+            (cameras[6].prior(6).unwrap(), CameraPrior::of_usual_photo(6, &camera(800.0)).unwrap());
         assert_eq!((prior.parameters[0].value, prior.parameters[0].sigma), (800.0, 8.0));
         assert_eq!(prior.parameters[2..], usual.parameters[2..]);
+        // Of three cameras, or with three photos to each, they keep them.
+        for kept in [&[1, 2, 3, 1][..], &[1, 2, 3, 4, 1, 2, 3, 4, 1, 2, 3, 4], &[0, 0, 0, 0]] {
+            assert_eq!(of_photos(kept).0, kept);
+        }
+        let two_to_each = [1, 2, 3, 4, 1, 2, 3, 4, 1, 2, 3];
+        assert_ne!(of_photos(&two_to_each).0, two_to_each);
     }
 
     #[test]
@@ -600,9 +653,7 @@ mod tests {
             world.photos[0].features.keypoints[matches[3].feature as usize].x += off_px;
             let view = &world.photos[0];
             let mut model = JointModel {
-                cameras: vec![world.camera.clone()],
-                camera_fixed: vec![true],
-                camera_alike: Vec::new(),
+                cameras: vec![JointCamera::new(world.camera.clone(), true)],
                 photos: vec![JointPhoto { camera: 0, world_from_camera: view.pose, standpoint: 0 }],
                 points: Vec::new(),
                 lengths: Vec::new(),

@@ -16,8 +16,7 @@ use setloc_sfm::{
 use crate::advice::{Link, name_open_pairs, widest_paths};
 use crate::{
     CamsetParams, LocalModels, PhotoLocalization, PlacedModel, QueryPhoto, Scene, SetLocalization,
-    SingleLocalization, Verdict, Views,
-    verdict::{standard_deviations, weaker},
+    SingleLocalization, Verdict, Views, verdict::standard_deviations,
 };
 
 use joint::{Component, ComponentAnswer, ComponentPoses};
@@ -231,6 +230,12 @@ fn locate_by(
     Answer { set: answer, remarks, elsewhere, seen }
 }
 
+/// Whether each photo of a local model is localized alone, at the place that the model gives it.
+fn agree_alone(evidence: &[&SingleLocalization], members: &[usize], found: &ComponentPoses) -> Vec<bool> {
+    let is_alone = |photo: &usize| evidence[*photo].photo.verdict == Verdict::Localized;
+    members.iter().zip(&found.elsewhere).map(|(photo, elsewhere)| is_alone(photo) && !elsewhere).collect()
+}
+
 /// Makes photos uncertain that the local model joins to those that the scene holds against more matches than points.
 ///
 /// The side that more photos localized alone agree with is held, else the one that sees more of the scene. On the other only
@@ -244,28 +249,22 @@ fn doubt_beyond(
 ) {
     let on_side: Vec<bool> =
         members.iter().map(|&photo| pair.side.binary_search(&ImageId(photo as u32)).is_ok()).collect();
-    let agrees_alone =
-        |slot: usize| evidence[members[slot]].photo.verdict == Verdict::Localized && !found.elsewhere[slot];
+    let agrees_alone = agree_alone(evidence, members, found);
     let held = |side: bool| {
         let slots = (0..members.len()).filter(|&slot| on_side[slot] == side);
         slots
-            .map(|slot| (usize::from(agrees_alone(slot)), found.scene_points[slot]))
+            .map(|slot| (usize::from(agrees_alone[slot]), found.scene_points[slot]))
             .fold((0, 0), |(alone, seen), (is_alone, points)| (alone + is_alone, seen + points))
     };
     let is_first_held = held(true) >= held(false);
-    let doubtful: Vec<usize> =
-        (0..members.len()).filter(|&slot| on_side[slot] != is_first_held && !agrees_alone(slot)).collect();
     let [first, second] =
         [pair.first, pair.second].map(|image| photos.get(image.index()).map_or("", |photo| photo.name));
     let reason = format!(
         "the {} matches of {first} and {second} contradict its local model, which {} points hold together between them",
         pair.matches, pair.held_by
     );
-    for slot in doubtful {
-        for photo in [&mut found.rigid[slot], &mut found.refined[slot]] {
-            photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
-            photo.reasons.push(reason.clone());
-        }
+    for slot in (0..members.len()).filter(|&slot| on_side[slot] != is_first_held && !agrees_alone[slot]) {
+        found.doubt(slot, &reason);
     }
     found.remarks.push(reason);
 }
@@ -279,15 +278,11 @@ fn doubt_folded(
     members: &[usize],
     found: &mut ComponentPoses,
 ) {
+    let agrees_alone = agree_alone(evidence, members, found);
     for (slot, &photo) in members.iter().enumerate() {
-        let is_alone = evidence[photo].photo.verdict == Verdict::Localized && !found.elsewhere[slot];
-        let is_doubtful = doubtful.binary_search(&ImageId(photo as u32)).is_ok();
-        if !is_doubtful || is_alone || found.scene_points[slot] >= enough {
-            continue;
-        }
-        for photo in [&mut found.rigid[slot], &mut found.refined[slot]] {
-            photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
-            photo.reasons.push("its local model may be folded about it".to_owned());
+        let is_held = agrees_alone[slot] || found.scene_points[slot] >= enough;
+        if !is_held && doubtful.binary_search(&ImageId(photo as u32)).is_ok() {
+            found.doubt(slot, "its local model may be folded about it");
         }
     }
 }

@@ -8,7 +8,7 @@ use setloc_sfm::{ImageId, Rigid};
 
 use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
 use crate::guided::guided_matches;
-use crate::refine::{JointModel, JointObservations, JointPhoto, refine_jointly};
+use crate::refine::{JointCamera, JointModel, JointObservations, JointPhoto, refine_jointly};
 use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_precision, judge_support, weaker};
@@ -123,7 +123,7 @@ fn solve(
     seed: u64,
 ) -> Option<SinglePose> {
     let Fit { mut model, agreeing, .. } = fit(params, (scene, ground), photo, matches, seed)?;
-    let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
+    let (camera, pose) = (model.camera_of(0).clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
     let depth =
         median(agreeing.iter().map(|m| (scene.index.position(m.point) - pose.translation).norm()).collect())?;
@@ -166,7 +166,7 @@ fn solve(
         model.photos[0].world_from_camera = other;
     }
     let covariance = refine(&mut model, scene, photo, &candidates, params.max_error_sigmas, true);
-    let (camera, pose) = (model.cameras[0].clone(), model.photos[0].world_from_camera);
+    let (camera, pose) = (model.camera_of(0).clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
     let inliers = inliers(&rays, scene.index, &pose, &candidates, params.max_error_sigmas);
     if evidence.off_ground < MIN_OFF_GROUND
@@ -176,8 +176,9 @@ fn solve(
             let aside = Rigid::new(pose.rotation, pose.translation + slide);
             guided_matches(&params.guided, scene.index, &rays, nearest, &aside)
         };
-        if let Some((shown, _)) = underfoot.count_shown_elsewhere(ground, depth, shown) {
-            evidence.off_ground = evidence.off_ground.max(shown);
+        let found = ground.count_off(&shown(&Vector3::zeros()));
+        if underfoot.log10_chance_elsewhere(ground, depth, found, shown).is_some() {
+            evidence.off_ground = evidence.off_ground.max(found);
         }
     }
     Some(SinglePose { camera, world_from_camera: pose, covariance, inliers, depth, evidence })
@@ -202,15 +203,13 @@ fn fit(
 ) -> Option<Fit> {
     let refined = |camera: Camera, pose: Rigid| {
         let mut model = JointModel {
-            cameras: vec![camera],
-            camera_fixed: vec![photo.calibration.is_settled()],
-            camera_alike: Vec::new(),
+            cameras: vec![JointCamera::new(camera, photo.calibration.is_settled())],
             photos: vec![JointPhoto { camera: 0, world_from_camera: pose, standpoint: 0 }],
             points: Vec::new(),
             lengths: Vec::new(),
         };
         refine(&mut model, scene, photo, matches, params.max_error_sigmas, false);
-        let rays = PhotoRays::new(photo.features, &model.cameras[0]);
+        let rays = PhotoRays::new(photo.features, model.camera_of(0));
         let pose = model.photos[0].world_from_camera;
         let agreeing = inliers(&rays, scene.index, &pose, matches, params.max_error_sigmas);
         let score = score(params, (scene.index, ground), &rays, &pose, matches);
@@ -231,11 +230,11 @@ fn fit(
     }
     let guesses: Vec<Camera> = Camera::fisheye_guesses(photo.camera.width, photo.camera.height).collect();
     let bent = usual.as_ref().and_then(|usual| {
-        Some(refined(usual.model.cameras[0].as_fisheye()?, usual.model.photos[0].world_from_camera))
+        Some(refined(usual.model.camera_of(0).as_fisheye()?, usual.model.photos[0].world_from_camera))
     });
     let fisheyes = [of_lens(&guesses, seed ^ 0xf15e), bent].into_iter().flatten();
     let fisheye = fisheyes
-        .filter(|fit| fit.model.cameras[0].is_wide())
+        .filter(|fit| fit.model.camera_of(0).is_wide())
         .max_by(|one, other| one.score.total_cmp(&other.score));
     let score = |fit: &Option<Fit>| fit.as_ref().map_or(0.0, |fit| fit.score);
     if score(&fisheye) > FISHEYE_GAIN * score(&usual) { fisheye } else { usual }
@@ -253,7 +252,7 @@ fn refine(
     let index = scene.index;
     let mut covariance = None;
     for last in [false, true] {
-        let camera = model.cameras[0].clone();
+        let camera = model.camera_of(0).clone();
         let rays = PhotoRays::new(photo.features, &camera);
         let agreeing = inliers(&rays, index, &model.photos[0].world_from_camera, matches, max_error_sigmas);
         if agreeing.len() <= SAMPLE {

@@ -58,24 +58,23 @@ impl Underfoot {
         seen.iter().zip(below).filter(is_elsewhere).count()
     }
 
-    /// How many matches guided matching shows elsewhere than on the ground, and log₁₀ of the chance of as many from a wrong
-    /// place; `None` where these are not clearly more than photos show that are slid along it.
+    /// log₁₀ of the chance of as many matches elsewhere than on the ground from a wrong place as guided matching found; `None`
+    /// where these are not clearly more than photos show that are slid along it.
     ///
     /// `shown` finds the matches of photos that are moved so; `depth` is how far off what they see is. The ratio test hides
     /// what repeats or looks alike, guided matching shows it, by chance as well: what slid photos show tells how much.
-    pub(crate) fn count_shown_elsewhere(
+    pub(crate) fn log10_chance_elsewhere(
         &self,
         ground: &Ground,
         depth: f64,
+        found: usize,
         shown: impl Fn(&Vector3<f64>) -> Vec<SceneMatch> + Sync,
-    ) -> Option<(usize, f64)> {
-        let count =
-            |slide: &Vector3<f64>| shown(slide).iter().filter(|found| !ground.holds(found.point)).count();
-        let found = count(&Vector3::zeros());
+    ) -> Option<f64> {
         let aside = self.slides(depth);
+        let count = |slide: &Vector3<f64>| ground.count_off(&shown(slide));
         let by_chance = aside.par_iter().with_max_len(1).map(count).max().unwrap_or(0) + POSE_MATCHES;
         let chance = log10_chance_of_more(found, by_chance as f64);
-        (chance <= MAX_LOG10_CHANCE).then_some((found, chance))
+        (chance <= MAX_LOG10_CHANCE).then_some(chance)
     }
 
     /// Displacements along the ground.
@@ -158,6 +157,11 @@ impl Ground {
         if self.holds(point) { GROUND_WORTH } else { 1.0 }
     }
 
+    /// How many matches are to points that do not lie on it.
+    pub(crate) fn count_off(&self, matches: &[SceneMatch]) -> usize {
+        matches.iter().filter(|found| !self.holds(found.point)).count()
+    }
+
     /// Whether a point lies on the ground.
     pub(crate) fn holds(&self, point: PointId) -> bool {
         self.is_ground.get(point.index()) == Some(&true)
@@ -228,15 +232,16 @@ mod tests {
             let points = (0..paving).chain(100..100 + facades);
             points.map(|point| SceneMatch { feature: point, point: PointId(point) }).collect()
         };
-        let count = |here: u32, aside: u32| {
-            DOWN.count_shown_elsewhere(&ground, 5.0, |slide| {
-                assert!(slide.z.abs() < 1e-12 && slide.norm() < 2.5);
-                if slide.norm() == 0.0 { matches(60, here) } else { matches(40, aside) }
+        let chance = |here: u32, aside: u32| {
+            let found = ground.count_off(&matches(60, here));
+            assert_eq!(found, here as usize);
+            DOWN.log10_chance_elsewhere(&ground, 5.0, found, |slide| {
+                assert!(slide.z.abs() < 1e-12 && slide.norm() > 0.1 && slide.norm() < 2.5);
+                matches(40, aside)
             })
         };
-        let (found, chance) = count(40, 4).expect("stands out");
-        assert!(found == 40 && chance < -10.0, "{found} {chance}");
-        assert_eq!([count(40, 30), count(5, 0), count(0, 0)], [None; 3]);
+        assert!(chance(40, 4).expect("stands out") < -10.0);
+        assert_eq!([chance(40, 30), chance(5, 0), chance(0, 0)], [None; 3]);
     }
 
     #[test]

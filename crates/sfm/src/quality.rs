@@ -117,10 +117,11 @@ pub fn doubtful_images(component: &Reconstruction, outvoted: &[OutvotedPair]) ->
     let all = component.registered().count();
     groups.retain(|_, images| 2 * images.len() <= all);
     let mut doubtful: BTreeSet<ImageId> = groups.into_values().flatten().collect();
+    let images_of = |point: &ReconstructionPoint| point.track.iter().map(|seen| seen.image).collect();
+    let seen_by: Vec<BTreeSet<ImageId>> = component.points.iter().map(images_of).collect();
     for _ in 0..DOUBTFUL_STEPS {
         let mut ties: BTreeMap<ImageId, usize> = BTreeMap::new();
-        for point in &component.points {
-            let seen: BTreeSet<ImageId> = point.track.iter().map(|seen| seen.image).collect();
+        for seen in &seen_by {
             if !seen.is_disjoint(&doubtful) {
                 seen.difference(&doubtful).for_each(|image| *ties.entry(*image).or_default() += 1);
             }

@@ -20,7 +20,7 @@ use crate::evidence::{
 };
 use crate::guided::guided_matches;
 use crate::refine::{
-    JointModel, JointObservations, JointPhoto, SceneView, Sighting, TiedPoint, refine_jointly,
+    JointCamera, JointModel, JointObservations, JointPhoto, SceneView, Sighting, TiedPoint, refine_jointly,
 };
 use crate::single::{inliers, union};
 use crate::types::DOUBTFUL;
@@ -40,10 +40,6 @@ const MIN_KEPT: f64 = 0.5;
 
 /// Fewest matches seen from elsewhere than the rest that give a set its scale at all.
 const MIN_FOR_SCALE: usize = 3;
-
-/// Cameras from which on photos may have zooms of any focal length, and the photos to each that speak for fewer.
-const MANY_CAMERAS: usize = 4;
-const MANY_PHOTOS: usize = 3;
 
 /// Scene points that tell the focal length of a photo whose local model does not.
 const MIN_TELLING: usize = 30;
@@ -76,6 +72,16 @@ pub(crate) struct ComponentPoses {
     pub remarks: Vec<String>,
 }
 
+impl ComponentPoses {
+    /// Makes a photo uncertain, for this reason.
+    pub fn doubt(&mut self, slot: usize, reason: &str) {
+        for photo in [&mut self.rigid[slot], &mut self.refined[slot]] {
+            photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
+            photo.reasons.push(reason.to_owned());
+        }
+    }
+}
+
 /// A local model of at least two photos and what is known of them.
 pub(crate) struct Component<'a> {
     pub params: &'a CamsetParams,
@@ -106,10 +112,6 @@ struct Joint {
 }
 
 impl Joint {
-    fn camera_of(&self, slot: usize) -> &Camera {
-        &self.model.cameras[self.model.photos[slot].camera]
-    }
-
     /// The standpoint whose photos see most of the scene.
     fn main_standpoint(&self) -> usize {
         let mut seen = vec![0_usize; self.direct.len()];
@@ -146,7 +148,7 @@ impl Component<'_> {
     /// Localizes the component.
     pub(crate) fn locate(&self, seed: u64) -> ComponentAnswer {
         let params = self.params;
-        let rays = self.rays(&self.model.cameras, |slot| self.camera_of(slot));
+        let rays = self.rays(|slot| &self.model.cameras[self.camera_of(slot)]);
         let mut set_from_camera: Vec<Rigid> = self
             .members
             .iter()
@@ -272,15 +274,11 @@ impl Component<'_> {
         self.model.images[self.members[slot]].camera.index()
     }
 
-    fn rays<'c>(
-        &'c self,
-        cameras: &'c [Camera],
-        camera_of: impl Fn(usize) -> usize + Sync,
-    ) -> Vec<PhotoRays<'c>> {
+    fn rays<'c>(&'c self, camera_of: impl Fn(usize) -> &'c Camera + Sync) -> Vec<PhotoRays<'c>> {
         (0..self.members.len())
             .into_par_iter()
             .with_max_len(1)
-            .map(|slot| PhotoRays::new(self.photos[self.members[slot]].features, &cameras[camera_of(slot)]))
+            .map(|slot| PhotoRays::new(self.photos[self.members[slot]].features, camera_of(slot)))
             .collect()
     }
 
@@ -432,13 +430,14 @@ impl Component<'_> {
         let slid = |slide: &Vector3<f64>| -> Vec<Rigid> {
             poses.iter().map(|pose| Rigid::new(pose.rotation, pose.translation + slide)).collect()
         };
-        let (_, log10_chance) = underfoot.count_shown_elsewhere(ground, depth, |slide| {
-            self.guided(rays, slid(slide)).into_iter().flatten().collect()
-        })?;
-        let mut shown = self.guided(rays, poses);
+        let mut shown = self.guided(rays, poses.clone());
         for shown in &mut shown {
             shown.retain(|found| !ground.holds(found.point));
         }
+        let found = shown.iter().map(Vec::len).sum();
+        let log10_chance = underfoot.log10_chance_elsewhere(ground, depth, found, |slide| {
+            self.guided(rays, slid(slide)).into_iter().flatten().collect()
+        })?;
         Some((shown, log10_chance))
     }
 
@@ -474,7 +473,7 @@ impl Component<'_> {
         let (mut features, mut explained, mut chance) = (0, 0, 0.0);
         for (slot, direct) in joint.direct.iter().enumerate() {
             let count = self.photos[self.members[slot]].features.len();
-            let camera = joint.camera_of(slot);
+            let camera = joint.model.camera_of(slot);
             let radius_share = std::f64::consts::PI * self.params.guided.radius_px.powi(2)
                 / (f64::from(camera.width) * f64::from(camera.height)).max(1.0);
             features += count;
@@ -520,10 +519,9 @@ impl Component<'_> {
         rigid: &RigidPose,
     ) -> Joint {
         let world_from_set = &rigid.world_from_set;
+        let cameras = self.model.cameras.iter().cloned().zip(self.fixed_cameras());
         let mut model = JointModel {
-            cameras: self.model.cameras.clone(),
-            camera_fixed: self.fixed_cameras(),
-            camera_alike: Vec::new(),
+            cameras: cameras.map(|(camera, is_known)| JointCamera::new(camera, is_known)).collect(),
             photos: set_from_camera
                 .iter()
                 .enumerate()
@@ -541,14 +539,12 @@ impl Component<'_> {
                 .collect(),
             lengths: self.lengths().map(|(slots, length)| (slots, length.held().1)).collect(),
         };
-        if are_many(&self.open_cameras()) {
-            model.give_own_cameras();
-        }
+        model.give_own_cameras_where_many();
         let mut covariances = Vec::new();
         for round in 0..=self.params.rounds {
-            let cameras = model.cameras.clone();
-            let camera_of: Vec<usize> = model.photos.iter().map(|photo| photo.camera).collect();
-            let rays = self.rays(&cameras, |slot| camera_of[slot]);
+            let cameras: Vec<Camera> =
+                (0..self.members.len()).map(|slot| model.camera_of(slot).clone()).collect();
+            let rays = self.rays(|slot| &cameras[slot]);
             let mut observations = if round == 0 {
                 self.rigid_observations(candidates, rigid)
             } else {
@@ -565,7 +561,7 @@ impl Component<'_> {
             covariances = refine_jointly(&mut model, self.scene, &rays, &observations, last);
             model.points.truncate(local_points);
         }
-        let rays = self.rays(&model.cameras, |slot| model.photos[slot].camera);
+        let rays = self.rays(|slot| model.camera_of(slot));
         let direct = self.observations(&model, &rays, candidates, world_from_set, 1.0).direct;
         let agreeing = self.agreeing_sights(sights, &model);
         let mut viewed = vec![0; self.members.len()];
@@ -630,12 +626,6 @@ impl Component<'_> {
             sight.error_sigmas_of(&model.points[sight.local]) < self.params.max_error_sigmas
         };
         (0..sights.all.len()).filter(agrees).collect()
-    }
-
-    /// The cameras of the photos whose cameras are not known.
-    fn open_cameras(&self) -> Vec<usize> {
-        let fixed = self.fixed_cameras();
-        (0..self.members.len()).map(|slot| self.camera_of(slot)).filter(|&camera| !fixed[camera]).collect()
     }
 
     /// A camera is known when all photos that share it say so.
@@ -920,7 +910,7 @@ impl Component<'_> {
                 let verdict = weaker(verdict, precision);
                 let answer = PhotoLocalization {
                     name: self.photos[photo].name.to_owned(),
-                    camera: joint.camera_of(slot).clone(),
+                    camera: joint.model.camera_of(slot).clone(),
                     component: self.scene.component,
                     world_from_camera: Some(pose),
                     covariance,
@@ -978,13 +968,6 @@ impl Component<'_> {
             })
             .unwrap_or(0.0)
     }
-}
-
-/// Whether photos of these cameras have so many that hardly two have one: a zoom has any focal length, and those that are
-/// not told apart need not be one.
-fn are_many(of_photos: &[usize]) -> bool {
-    let cameras = of_photos.iter().collect::<BTreeSet<_>>().len();
-    cameras >= MANY_CAMERAS && of_photos.len() < MANY_PHOTOS * cameras
 }
 
 /// Those of some sights whose local points are free.
@@ -1055,13 +1038,6 @@ mod tests {
     use setloc_sfm::PointId;
 
     use super::*;
-
-    #[test]
-    fn cameras_are_many_where_hardly_two_photos_have_one() {
-        assert!(are_many(&[0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2]));
-        assert!(!are_many(&[0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3]));
-        assert!(!are_many(&[0, 1, 2, 0]) && !are_many(&[]));
-    }
 
     #[test]
     fn matches_of_one_standpoint_say_nothing_of_scale() {
