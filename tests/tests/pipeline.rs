@@ -86,7 +86,7 @@ fn a_set_of_unknown_intrinsics_is_located_and_tells_them() {
     let config = Config::default();
     let panoramas = read("panoramas", &CameraBook::default());
     let built = built(&session, &panoramas, &config);
-    let what = LocateJobs { scene: Arc::clone(&built.scene), config, seed: 0 };
+    let what = LocateJobs { scene: Arc::clone(&built.scene), pictures: Arc::default(), config, seed: 0 };
     let known = CameraBook::read(&folder.path().join("cameras.json")).unwrap();
     let mut by_cameras = [read("queries/lane", &known), read("queries/lane", &CameraBook::default())];
     let truth = by_cameras[0].images[0].camera.clone();
@@ -131,12 +131,17 @@ fn photos_localized_earlier_localize_one_that_the_panoramas_do_not() {
         ImageFolder { images: bridging.images.pop().into_iter().collect(), ..ImageFolder::default() };
     let (name, last_one) = (target.images[0].name.clone(), target.images.clone());
     let mut alone = |scene| {
-        let what = LocateJobs { scene, config: config.clone(), seed: 0 };
+        let what = LocateJobs { scene, pictures: Arc::default(), config: config.clone(), seed: 0 };
         locate(&session, &mut target, &what, Mode::Single, "alone", &name).unwrap().single[0].clone()
     };
     assert_ne!(alone(Arc::clone(&built.scene)).verdict, Verdict::Localized);
 
-    let what = LocateJobs { scene: Arc::clone(&built.scene), config: config.clone(), seed: 0 };
+    let what = LocateJobs {
+        scene: Arc::clone(&built.scene),
+        pictures: Arc::default(),
+        config: config.clone(),
+        seed: 0,
+    };
     let last = bridging.images.last().unwrap().name.clone();
     let located = locate(&session, &mut bridging, &what, Mode::Both, "set", &last).unwrap();
     let grown = grow(&session, &bridging, &what, ("grow", &last), &located).unwrap().unwrap();
@@ -165,6 +170,22 @@ fn the_small_rendered_street_is_mapped_and_its_set_located() {
         return;
     }
     assert_main_job(&bench(&dataset));
+}
+
+/// Of these photos along a wall one sees the scene by keypoints; two of its neighbours show a slice of a façade across the street.
+#[test]
+fn a_real_set_of_which_one_standpoint_sees_the_scene_gets_its_scale_from_a_facade() {
+    let dataset = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/lzr");
+    if !dataset.join("cameras.json").is_file() {
+        println!("skipped: {} is not present", dataset.display());
+        return;
+    }
+    let localized = |scale_by_walls: bool| {
+        let mut config = Config::default();
+        config.camset.scale_by_walls = scale_by_walls;
+        bench_with(&dataset, config).sets[0].methods["camset+opt"].registered
+    };
+    assert!(localized(true) >= localized(false) + 4);
 }
 
 #[test]

@@ -23,6 +23,7 @@ mod guided;
 mod jackknife;
 mod observability;
 mod params;
+mod pictures;
 mod refine;
 mod set;
 mod single;
@@ -36,6 +37,7 @@ pub use advice::{Link, PathToScene};
 pub use anywhere::locate_single_anywhere;
 pub use grow::{GrownScene, Growth, GrowthParams, GrowthPhoto, GrowthPoint, grow};
 pub use params::{CamsetMethod, CamsetParams, GuidedParams, SingleParams, VerdictParams};
+pub use pictures::{Picture, Pictures};
 pub use set::{locate_set, locate_set_anywhere};
 pub use single::locate_single;
 pub use types::{
@@ -62,8 +64,8 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// contradict is uncertain. 29: what guided matching shows beside the ground counts,
 /// and where hardly any match agrees, it chooses the pose. 30: photos localized alone far from where stronger ones put
 /// them, and what is seen where a scene may be folded, are uncertain. 31: where a set's photos have many cameras, those
-/// that share one have focal lengths of their own.
-pub const VERSION: u32 = 31;
+/// that share one have focal lengths of their own. 32: a set's scale by the walls that its photos show.
+pub const VERSION: u32 = 32;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

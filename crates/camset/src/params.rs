@@ -125,6 +125,9 @@ pub struct CamsetParams {
     pub guided: GuidedParams,
     /// Matching with the scene's images beside its points, for photos that these do not localize.
     pub views: ViewParams,
+    /// Whether a scale that nothing else tells is sought by the walls that photos and scene show, where their pixels are at
+    /// hand.
+    pub scale_by_walls: bool,
     /// When poses may be used.
     pub verdict: VerdictParams,
 }
@@ -142,13 +145,15 @@ impl Default for CamsetParams {
             max_error_sigmas: 4.0,
             guided: GuidedParams::default(),
             views: ViewParams::default(),
+            scale_by_walls: true,
             verdict: VerdictParams::default(),
         }
     }
 }
 
 impl CamsetParams {
-    /// The paper's settings: DLT and no other hypotheses, both ratios 0.6, neither lone rays nor the scene's images.
+    /// The paper's settings: DLT and no other hypotheses, both ratios 0.6, neither lone rays nor the scene's images,
+    /// nor its walls.
     pub fn paper() -> Self {
         Self {
             method: CamsetMethod::Dlt,
@@ -157,6 +162,7 @@ impl CamsetParams {
             reverse_ratio: 0.6,
             lone_rays: false,
             views: ViewParams { max_images: 0, ..ViewParams::default() },
+            scale_by_walls: false,
             ..Self::default()
         }
     }

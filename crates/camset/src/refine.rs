@@ -9,7 +9,7 @@ use setloc_sfm::bundle::{
     self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, CameraPrior,
     IntrinsicsFreedom, LengthRatio, RobustLoss,
 };
-use setloc_sfm::{ImageId, Place, PointId, Rigid};
+use setloc_sfm::{ImageId, Place, PointId, Rigid, WallSight};
 
 use crate::common::{CommonErrors, PoseError, shift_of_point};
 use crate::evidence::{PhotoRays, ray_error_sigmas};
@@ -142,6 +142,8 @@ pub(crate) struct JointObservations {
     pub tracks: Vec<(usize, Sighting)>,
     /// Free local points, by their index, and where images of the scene show them.
     pub views: Vec<(usize, SceneView)>,
+    /// Spots of the scene's walls.
+    pub walls: Vec<WallSight>,
 }
 
 /// A place in an image of the scene.
@@ -204,7 +206,7 @@ pub(crate) fn refine_jointly(
     cameras.push(sphere());
     let mut common = CommonErrors::default();
     for &ScenePrior { point, scene_point, ref covariance } in &priors {
-        let shift = shift_of_point(scene, scene_point);
+        let shift = scene_point.and_then(|point| shift_of_point(scene, point));
         for prior in prior_bearings(&points[point as usize].position, covariance) {
             let pose = poses.len() as u32;
             let camera = model.cameras.len() as u32;
@@ -294,7 +296,8 @@ enum Origin {
 /// A point of a bundle problem that is a scene point, and what the scene knows of it.
 struct ScenePrior {
     point: u32,
-    scene_point: PointId,
+    /// `None` of a spot of a wall.
+    scene_point: Option<PointId>,
     covariance: Matrix3<f64>,
 }
 
@@ -330,6 +333,12 @@ impl Builder<'_> {
                 self.observe(slot, &self.rays[slot].place_of(found.feature), point, Origin::Scene);
             }
         }
+        for &WallSight { photo, place, position, covariance } in &observed.walls {
+            let point = self.points.len() as u32;
+            self.points.push(BundlePoint { position, fixed: false });
+            self.priors.push(ScenePrior { point, scene_point: None, covariance });
+            self.observe(photo, &place, point, Origin::Scene);
+        }
         for (point, seen) in &observed.tracks {
             self.observe(seen.photo, &seen.place, *point as u32, Origin::Local);
         }
@@ -344,7 +353,7 @@ impl Builder<'_> {
         let fixed = covariance == Matrix3::zeros();
         self.points.push(BundlePoint { position, fixed });
         if !fixed {
-            self.priors.push(ScenePrior { point, scene_point, covariance });
+            self.priors.push(ScenePrior { point, scene_point: Some(scene_point), covariance });
         }
         point
     }

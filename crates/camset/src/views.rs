@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use setloc_features::{ImageFeatures, MatchParams, match_features};
 use setloc_sfm::{ImageId, Observation, Rigid, TwoViewKind, TwoViewParams, verify_pair};
 
-use crate::{QueryPhoto, Scene, SingleLocalization};
+use crate::{Pictures, QueryPhoto, Scene, SingleLocalization};
 
 /// How photos are matched with the scene's images.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -52,6 +52,8 @@ pub struct Views {
     pub geometries: Vec<ViewGeometry>,
     /// Matches of each photo that passed the ratio test, verified or not.
     pub putative: Vec<usize>,
+    /// Pixels of both, to tell a scale that the matches do not.
+    pub pictures: Pictures,
 }
 
 /// How a photo stands to a scene image, up to the distance.
@@ -137,5 +139,5 @@ pub fn match_views(
     }
     matches.sort_unstable();
     matches.dedup();
-    Views { features: views, matches, geometries, putative }
+    Views { features: views, matches, geometries, putative, pictures: Pictures::default() }
 }

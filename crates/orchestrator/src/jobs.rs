@@ -6,6 +6,7 @@ mod likely;
 mod locate;
 mod model;
 mod pairs;
+mod pixels;
 mod positions;
 mod scene;
 

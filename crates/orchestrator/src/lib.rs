@@ -23,6 +23,7 @@ pub mod import;
 pub mod jobs;
 pub mod locating;
 pub mod manifest;
+pub mod pictures;
 pub mod plot;
 pub mod print;
 pub mod scene;

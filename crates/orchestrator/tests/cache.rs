@@ -100,7 +100,7 @@ fn build_and_locate(folder: &Path, config: &Config) -> Vec<String> {
         BuildOutcome::Unchanged(..) => panic!("no present hash was given"),
     };
     assert!(built.scene.main().is_some(), "the small town must be mapped for this test to say anything");
-    let what = LocateJobs { scene: built.scene, config: config.clone(), seed: 7 };
+    let what = LocateJobs { scene: built.scene, pictures: Arc::default(), config: config.clone(), seed: 7 };
     let mut photos = read("queries/lane");
     let target = photos.images.last().unwrap().name.clone();
     locate(&session, &mut photos, &what, Mode::Both, "lane", &target).unwrap();

@@ -8,9 +8,9 @@
 //! tell ([`floor`]). Where nothing else tells how long the step is, the ground alone may ([`open`]).
 
 mod corner;
-mod floor;
+pub(crate) mod floor;
 mod open;
-mod sight;
+pub(crate) mod sight;
 
 pub use open::register_by_ground;
 
@@ -23,7 +23,7 @@ use self::{corner::Sharpened, floor::Floor, sight::View};
 use crate::{BaselineLength, ImageId, Reconstruction, Rigid, StepPose};
 
 /// How patches of the ground are aligned: at a grazing angle little of them is sharp.
-const PATCH: PatchParams =
+pub(crate) const PATCH: PatchParams =
     PatchParams { radius: 7, max_iterations: 10, min_correlation: 0.65, max_distortion: 0.5 };
 /// Correlation at the first look below which a patch is not followed.
 const MIN_FIRST: f64 = 0.35;

@@ -18,6 +18,7 @@ pub mod solvers;
 pub mod synthetic;
 mod two_view;
 mod visibility;
+mod walls;
 
 pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, align_tracks};
 pub use geometry::{Rigid, Similarity};
@@ -36,3 +37,4 @@ pub use reconstruction::{
     ReconstructionImage, ReconstructionPoint, StepPose,
 };
 pub use two_view::{PairGeometry, TWO_VIEW_VERSION, TwoView, TwoViewKind, TwoViewParams, verify_pair};
+pub use walls::{DistantPhoto, ScaleByWalls, WallSight, scale_by_walls};

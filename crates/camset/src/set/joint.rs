@@ -2,15 +2,17 @@
 
 mod distrust;
 mod hung;
+mod walls;
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use rayon::prelude::*;
 use setloc_features::{Calibration, Camera, Keypoint};
-use setloc_sfm::{ImageId, Place, PointId, Reconstruction, Rigid, Similarity};
+use setloc_sfm::{ImageId, Place, PointId, Reconstruction, Rigid, Similarity, WallSight};
 
 use self::distrust::is_distrusted;
+use self::walls::agreeing_walls;
 use super::called;
 use super::correspondences::{SetCorrespondence, correspondences, set_rays};
 use super::rigid::{RigidPose, SetPhotos, rigid_pose};
@@ -108,6 +110,8 @@ struct Joint {
     kept_sights: usize,
     /// Where lone rays of each photo and of images of the scene meet.
     met: Vec<Vec<Vector3<f64>>>,
+    /// Patches of the scene's walls that each photo shows.
+    walls: Vec<usize>,
     covariances: Vec<Option<Matrix6<f64>>>,
 }
 
@@ -172,7 +176,7 @@ impl Component<'_> {
         };
         let (given, sources) = ((&candidates[..], &worth[..]), (&set_rays, &sights));
         let rigid = rigid_pose(params, given, self.model, sources, &photos, shown, seed);
-        let Some(rigid) = rigid else {
+        let Some(mut rigid) = rigid else {
             let reasons =
                 vec![format!("no pose explains any of its {} matches to the scene", candidates.len())];
             return ComponentAnswer::Refused { reasons, scene_points: vec![0; self.members.len()] };
@@ -193,11 +197,11 @@ impl Component<'_> {
             }
             return ComponentAnswer::Refused { reasons, scene_points };
         }
-        let mut joint = self.refine_jointly(&set_from_camera, &candidates, &sights, &rigid);
+        let mut joint = self.refine_jointly(&set_from_camera, &candidates, &sights, &rigid, &[]);
         self.follow_pairs(&mut joint);
         evidence.log10_false_alarms = evidence.log10_false_alarms.min(self.joint_false_alarms(&joint));
         let mut support = judge_support(&params.verdict, &evidence, &mut reasons);
-        let elsewhere = seen_from_elsewhere(&set_from_camera, &candidates, &rigid.agreeing)
+        let mut elsewhere = seen_from_elsewhere(&set_from_camera, &candidates, &rigid.agreeing)
             .max(sights.seen_from_elsewhere(&rigid.sights, &rigid.lone));
         // One standpoint's matches place that standpoint; a few chance matches of the others then fit some scale.
         let has_scale = self.members.len() > 1;
@@ -205,8 +209,24 @@ impl Component<'_> {
             && elsewhere < params.verdict.min_inliers / 2
             && !self.scale_stands_out(&joint, &rays, &set_from_camera, &rigid)
         {
-            reasons.push(format!("its scale rests on {elsewhere} matches seen from elsewhere than the rest"));
-            support = weaker(support, Verdict::Uncertain);
+            if let Some(by_walls) = self.by_walls(&joint, &set_from_camera) {
+                rigid.move_to(
+                    by_walls.world_from_set,
+                    (&set_rays, candidates.len()),
+                    &sights,
+                    params.max_error_sigmas,
+                );
+                joint = self.refine_jointly(&set_from_camera, &candidates, &sights, &rigid, &by_walls.sights);
+                self.follow_pairs(&mut joint);
+                elsewhere = joint.walls.iter().sum();
+                reasons.push(by_walls.reason);
+            }
+            if elsewhere < params.verdict.min_inliers / 2 {
+                reasons.push(format!(
+                    "its scale rests on {elsewhere} matches seen from elsewhere than the rest"
+                ));
+                support = weaker(support, Verdict::Uncertain);
+            }
         }
         let supporting = rigid.agreeing.iter().map(|&number| candidates[number].scene);
         if self.scene.is_doubtful(supporting.chain(joint.direct.iter().flatten().map(|seen| seen.point))) {
@@ -258,8 +278,8 @@ impl Component<'_> {
             scene_points: joint
                 .direct
                 .iter()
-                .zip(&joint.viewed)
-                .map(|(direct, viewed)| direct.len() + viewed)
+                .zip(joint.viewed.iter().zip(&joint.walls))
+                .map(|(direct, (viewed, walls))| direct.len() + viewed + walls)
                 .collect(),
             // Without a pose there is nothing to contradict.
             elsewhere: (refined.iter().zip(elsewhere_alone))
@@ -517,6 +537,7 @@ impl Component<'_> {
         candidates: &[SetCorrespondence],
         sights: &Sights,
         rigid: &RigidPose,
+        walls: &[WallSight],
     ) -> Joint {
         let world_from_set = &rigid.world_from_set;
         let cameras = self.model.cameras.iter().cloned().zip(self.fixed_cameras());
@@ -555,6 +576,7 @@ impl Component<'_> {
             let agreeing =
                 if round == 0 { rigid.sights.clone() } else { self.agreeing_sights(sights, &model) };
             observations.views = free_views(sights, &agreeing, &observations.tracks);
+            observations.walls = agreeing_walls(&model, walls, self.params.max_error_sigmas * WIDENING[0]);
             let local_points = model.points.len();
             self.add_lone(sights, &mut model, &rays, &mut observations);
             let last = round == self.params.rounds;
@@ -585,7 +607,11 @@ impl Component<'_> {
         let viewed_from_elsewhere = sights.seen_from_elsewhere(&agreeing, &meeting);
         let kept = |of: &[usize], now: &[usize]| of.iter().filter(|at| now.binary_search(at).is_ok()).count();
         let kept_sights = kept(&rigid.sights, &agreeing) + kept(&rigid.lone, &meeting);
-        Joint { model, direct, viewed, viewed_from_elsewhere, kept_sights, met, covariances }
+        let mut shown = vec![0; self.members.len()];
+        for sight in agreeing_walls(&model, walls, bound) {
+            shown[sight.photo] += 1;
+        }
+        Joint { model, direct, viewed, viewed_from_elsewhere, kept_sights, met, walls: shown, covariances }
     }
 
     /// Adds what photos and images of the scene show alike beside the local points: points of their own, where the
@@ -651,7 +677,7 @@ impl Component<'_> {
             }
         }
         let direct = direct.into_iter().map(unique).collect();
-        JointObservations { direct, tied, tracks: self.free_tracks(&locals), views: Vec::new() }
+        JointObservations { direct, tied, tracks: self.free_tracks(&locals), ..JointObservations::default() }
     }
 
     /// A local point as a scene point with all its sightings, where it is aligned.
@@ -749,7 +775,7 @@ impl Component<'_> {
             direct[slot] = unique(union(&direct[slot], &agreeing));
         }
         let tracks = agreeing_tracks(model, rays, self.free_tracks(&locals), bound);
-        JointObservations { direct, tied, tracks, views: Vec::new() }
+        JointObservations { direct, tied, tracks, ..JointObservations::default() }
     }
 
     /// Slots and features that see a local point.
@@ -914,7 +940,7 @@ impl Component<'_> {
                     component: self.scene.component,
                     world_from_camera: Some(pose),
                     covariance,
-                    inliers: joint.direct[slot].len() + joint.viewed[slot],
+                    inliers: joint.direct[slot].len() + joint.viewed[slot] + joint.walls[slot],
                     verdict,
                     reasons,
                 };

@@ -29,6 +29,22 @@ pub(crate) struct RigidPose {
     pub observability: Observability,
 }
 
+impl RigidPose {
+    /// Takes another pose, and what agrees with it.
+    pub(crate) fn move_to(
+        &mut self,
+        world_from_set: Similarity,
+        (rays, count): (&SetRays, usize),
+        sights: &Sights,
+        bound: f64,
+    ) {
+        self.agreeing = rays.agreeing(&world_from_set, bound, count);
+        self.sights = sights.agreeing(&world_from_set, bound);
+        self.lone = sights.agreeing_lone(&world_from_set, bound);
+        self.world_from_set = world_from_set;
+    }
+}
+
 /// The photos of a local model: poses in the set's frame, indices among all photos, and what all photos know alone.
 pub(crate) struct SetPhotos<'a> {
     pub set_from_camera: &'a [Rigid],

@@ -18,6 +18,7 @@ use crate::dataset::{CameraBook, GeoSource, ImageFolder, SkippedImage, Truth, li
 use crate::error::Hinted;
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, Mode, locate};
+use crate::pictures::PictureBook;
 use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::subscribers::StageReport;
@@ -161,6 +162,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         BuildOutcome::Unchanged(..) => anyhow::bail!("the scene was not read: this is a bug"),
     };
     let model = built.scene.main().cloned().unwrap_or_default();
+    let pictures = Arc::new(PictureBook::of(&folder.images));
     let estimated = poses_of(&model);
     let true_scene = truth_of(truth.as_ref(), &format!("{kind}/"));
     let alignment = Alignment::of_centres(&estimated, &true_scene);
@@ -191,6 +193,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         let target = files.last().map(|(name, _)| name.clone()).unwrap_or_default();
         let what = LocateJobs {
             scene: Arc::clone(&built.scene),
+            pictures: Arc::clone(&pictures),
             config: options.config.clone(),
             seed: options.seed,
         };

@@ -19,6 +19,7 @@ use crate::export::{Marker, colmap_lacks, ply, remove_colmap, renew_colmap, scen
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, Prediction};
 use crate::jobs::{LikelyJobs, add_first_model, add_scene};
+use crate::pictures::PictureBook;
 use crate::print;
 use crate::scene::SceneFile;
 use crate::session::{Session, cache_folder};
@@ -70,6 +71,7 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
             (scene, run, skipped, true)
         }
     };
+    PictureBook::of(&folder.images).write(output)?;
     tell(&scene, &folder, &export);
     warn_skipped(&skipped);
     let (wall, cpu) = session.report.totals();

@@ -21,6 +21,7 @@ use crate::error::Hinted;
 use crate::export::{Marker, localizations_json, origin_json, ply, renew_colmap, top_view_png};
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, Mode, grow, locate};
+use crate::pictures::PictureBook;
 use crate::print;
 use crate::scene::SceneFile;
 use crate::session::Session;
@@ -54,7 +55,8 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     remark(&photos);
     // Results of photos are kept beside the scene, where those of its images are.
     let session = args.run.session(&args.scene, Some(&args.output))?;
-    let what = LocateJobs { scene: Arc::new(scene), config, seed: args.run.seed };
+    let pictures = Arc::new(PictureBook::read(&args.scene)?);
+    let what = LocateJobs { scene: Arc::new(scene), pictures, config, seed: args.run.seed };
     let name = session.store.name_of("locate", &args.output);
     let mode = match args.mode {
         // The scene grows by all photos, whatever the target is.
@@ -154,6 +156,7 @@ fn write_grown(
     let export = export_folder(output);
     write_atomically(output, &grown.file)?;
     write_models(&export, &grown.scene, &BTreeMap::new())?;
+    what.pictures.write(output)?;
     write_report(&export, (&grown.scene, grown.hash), &[], &[], session)?;
     let apart = located.answers().into_iter().map(|(_, photo)| photo);
     let apart = apart.filter(|photo| photo.verdict == Verdict::Localized && photo.component > 0);

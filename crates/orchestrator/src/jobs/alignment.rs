@@ -1,7 +1,7 @@
 //! The alignment of a scene's tracks by its images.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::{Context, Result};
@@ -83,7 +83,10 @@ fn run_alignment(
             .map(|image| component.cameras[image.camera.index()].wraps_around())
             .collect();
         let pyramids = Pyramids::default();
-        let load = |image: ImageId| pyramids.get(&sources[image_at[image.index()]], wraps[image.index()]);
+        let load = |image: ImageId| {
+            let (path, hash) = &sources[image_at[image.index()]];
+            pyramids.get((path, *hash), wraps[image.index()])
+        };
         let report = align_tracks(params, component, &features, camera_fixed, load)?;
         sharpen_lengths(component, load)?;
         let registered = register_by_ground(component, &waiting, &features, load)?;
@@ -101,22 +104,22 @@ fn run_alignment(
 
 /// Grey images in memory, as many as fit.
 #[derive(Default)]
-struct Pyramids {
+pub(super) struct Pyramids {
     kept: Mutex<(usize, BTreeMap<PathBuf, Arc<stages::ImagePyramid>>)>,
 }
 
 impl Pyramids {
-    fn get(&self, (path, hash): &(PathBuf, ContentHash), wraps: bool) -> Result<Arc<stages::ImagePyramid>> {
+    pub fn get(&self, (path, hash): (&Path, ContentHash), wraps: bool) -> Result<Arc<stages::ImagePyramid>> {
         if let Some(found) = self.kept.lock().unwrap_or_else(PoisonError::into_inner).1.get(path) {
             return Ok(Arc::clone(found));
         }
-        let bytes = read_unchanged(path, *hash)?;
+        let bytes = read_unchanged(path, hash)?;
         let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
         let pyramid = Arc::new(stages::ImagePyramid::new(&decoded, wraps));
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         if kept.0 + pyramid.byte_size() <= KEPT_BYTES {
             kept.0 += pyramid.byte_size();
-            kept.1.insert(path.clone(), Arc::clone(&pyramid));
+            kept.1.insert(path.to_owned(), Arc::clone(&pyramid));
         }
         Ok(pyramid)
     }

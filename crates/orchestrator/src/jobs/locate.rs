@@ -12,10 +12,12 @@ use setloc_index::SceneIndex;
 use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
 
 use super::model::{ModelJobs, ModelKind, ModelSource, add_model, features_role};
+use super::pixels::PicturesAtHand;
 use super::{choose_pairs, derived_seed};
 use crate::config::Config;
 use crate::dataset::SourceImage;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
+use crate::pictures::PictureBook;
 use crate::scene::SceneFile;
 use crate::stages;
 
@@ -24,6 +26,8 @@ use crate::stages;
 pub struct LocateJobs {
     /// The scene.
     pub scene: Arc<SceneFile>,
+    /// Where its images are, as far as they are at hand.
+    pub pictures: Arc<PictureBook>,
     /// Parameters.
     pub config: Config,
     /// Seed of everything random.
@@ -61,7 +65,8 @@ pub fn add_set(
     let listed: Vec<_> = photos.iter().map(|p| json!([p.name, p.camera, p.calibration])).collect();
     let Config { camset, matching, two_view, .. } = &what.config;
     let params = json!({
-        "camset": camset, "matching": matching, "two_view": two_view, "seed": what.seed, "photos": listed
+        "camset": camset, "matching": matching, "two_view": two_view, "seed": what.seed, "photos": listed,
+        "pictures": what.pictures.content(),
     });
     let (owned, what_here) = (photos.to_vec(), what.clone());
     let work = move |inputs: &Inputs<'_, '_>| run_set(inputs, &owned, &what_here);
@@ -95,6 +100,8 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
     let alone: Vec<&AnywhereLocalization> = alone.iter().map(|found| &**found).collect();
     let queries: Vec<QueryPhoto<'_>> =
         features.iter().map(|(photo, features)| query(photo, features)).collect();
+    let photos: Vec<&SourceImage> = features.iter().map(|(photo, _)| *photo).collect();
+    let pictures = PicturesAtHand::new(&what.pictures, &photos);
     let empty = EmptyScene::default();
     let components = components_of(&what.scene, &empty);
     let seed = derived_seed(what.seed, &["camset"]);
@@ -106,13 +113,15 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
         };
         let features = (0..scene.reconstruction.images.len()).map(read).collect::<Result<Vec<_>>>()?;
         let pairs = (&what.config.matching, &what.config.two_view);
-        Ok(match_views(&what.config.camset.views, pairs, scene, features, &likely, &queries, seed))
+        let views = match_views(&what.config.camset.views, pairs, scene, features, &likely, &queries, seed);
+        Ok(Views { pictures: pictures.of(scene), ..views })
     };
     let models =
         LocalModels { components: &model.components, open: &model.open_pairs, outvoted: &model.outvoted };
     let params = &what.config.camset;
-    let located: SetLocalization =
+    let mut located: SetLocalization =
         locate_set_anywhere(params, &components, &queries, &alone, models, views, seed)?;
+    located.advice.extend(pictures.failures());
     Product::new(located)
 }
 

@@ -64,7 +64,7 @@ pub(super) fn pairs(component: &Reconstruction, length: &BaselineLength) -> Vec<
 
 /// A plane by its unit normal and its distance from a camera's centre, in that camera's frame.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Ground {
+pub(crate) struct Ground {
     pub normal: Vector3<f64>,
     pub distance: f64,
 }

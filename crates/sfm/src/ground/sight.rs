@@ -15,14 +15,14 @@ pub(super) const SPARSE: [f64; 2] = [10.0, 7.0];
 pub(super) const DENSE: [f64; 2] = [6.0, 3.0];
 
 /// A photo with its pixels.
-pub(super) struct View<'a> {
+pub(crate) struct View<'a> {
     pub camera: &'a Camera,
     pub world_from_camera: Rigid,
     pub pyramid: Arc<ImagePyramid>,
 }
 
 /// A patch of a photo.
-pub(super) struct Piece {
+pub(crate) struct Piece {
     pub pixel: Vector2<f64>,
     pub bearing: Vector3<f64>,
     pub template: Template,

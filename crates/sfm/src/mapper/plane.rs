@@ -23,10 +23,18 @@ impl SeenPoint {
             let across = Matrix3::identity() - ray.direction * ray.direction.transpose();
             information += across / (ray.sigma * (position - ray.origin).norm()).powi(2);
         }
-        let position = position - center;
-        let covariance = information.try_inverse()?;
+        Self::known(position - center, information.try_inverse()?)
+    }
+
+    /// The point at this offset from the centre, of this covariance; `None` where these are no numbers.
+    pub fn known(position: Vector3<f64>, covariance: Matrix3<f64>) -> Option<Self> {
         let sound = position.norm_squared() > 0.0 && covariance.iter().all(|value| value.is_finite());
         sound.then_some(Self { position, covariance })
+    }
+
+    /// Standard deviation of its place along a direction.
+    pub fn along(&self, direction: &Vector3<f64>) -> f64 {
+        direction.dot(&(self.covariance * direction)).max(0.0).sqrt()
     }
 
     /// Standard deviation of the distance from a plane with this unit normal, its roughness included.
@@ -53,6 +61,11 @@ pub(crate) struct Plane {
 }
 
 impl Plane {
+    /// The middle of its points.
+    pub fn centroid(&self) -> &Vector3<f64> {
+        &self.centroid
+    }
+
     /// How far along a direction the plane is; `None` where the direction does not meet it, or at a grazing angle.
     pub fn depth_along(&self, direction: &Vector3<f64>) -> Option<f64> {
         let slant = self.normal.dot(direction);
