@@ -63,7 +63,7 @@ fn answer<E>(
         return Ok(by_points);
     }
     let views = views()?;
-    if views.matches.is_empty() && !views.pictures.are_some() {
+    if views.matches.is_empty() && !(params.scale_by_walls && views.pictures.are_some()) {
         return Ok(by_points);
     }
     let by_views = locate_by(params, scene, (photos, evidence), local_models, &views, seed);

@@ -7,8 +7,6 @@ use setloc_sfm::{PointId, Rigid};
 use crate::evidence::{log10_chance_of_more, median};
 use crate::{Scene, SceneMatch};
 
-/// Images stand about upright where the mean of their vertical axes is as long as this; else nobody knows which way is down.
-const MIN_UPRIGHT: f64 = 0.9;
 /// The ground may rise and fall by this share of the camera's height above it,
 const ROUGHNESS: f64 = 0.15;
 /// and by this much for each unit of distance.
@@ -34,10 +32,7 @@ pub(crate) struct Underfoot {
 impl Underfoot {
     /// By the images of the scene, which stand upright as street-view panoramas do; `None` where they do not.
     pub(crate) fn of_scene(scene: &Scene<'_>) -> Option<Self> {
-        let poses = scene.reconstruction.images.iter().filter_map(|image| image.world_from_camera);
-        let axes: Vec<Vector3<f64>> = poses.map(|pose| pose.rotation * Vector3::y()).collect();
-        let mean = axes.iter().sum::<Vector3<f64>>() / axes.len().max(1) as f64;
-        (mean.norm() >= MIN_UPRIGHT).then(|| Self { down: mean.normalize() })
+        scene.reconstruction.down().map(|down| Self { down })
     }
 
     /// How many of some points do not lie on the ground under the cameras that see them; each with that camera's centre.

@@ -70,6 +70,11 @@ impl PictureBook {
         write_atomically(&path, text.as_bytes())
     }
 
+    /// Whether it names none.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
     /// The file of an image.
     pub fn get(&self, name: &str) -> Option<&PictureFile> {
         self.0.get(name)

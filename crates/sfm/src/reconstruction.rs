@@ -48,6 +48,9 @@ pub struct ReconstructionImage {
     pub world_from_camera: Option<Rigid>,
 }
 
+/// Images stand about upright where the mean of their vertical axes is as long as this.
+const MIN_UPRIGHT: f64 = 0.9;
+
 /// One triangulated point with its track.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ReconstructionPoint {
@@ -275,6 +278,15 @@ impl Reconstruction {
     /// The camera of an image.
     pub fn camera_of(&self, image: ImageId) -> &Camera {
         &self.cameras[self.images[image.index()].camera.index()]
+    }
+
+    /// Which way is down, a unit vector: that of the images' vertical axes, which stand upright as street-view panoramas do;
+    /// `None` where they do not.
+    pub fn down(&self) -> Option<Vector3<f64>> {
+        let poses = self.images.iter().filter_map(|image| image.world_from_camera);
+        let axes: Vec<Vector3<f64>> = poses.map(|pose| pose.rotation * Vector3::y()).collect();
+        let mean = axes.iter().sum::<Vector3<f64>>() / axes.len().max(1) as f64;
+        (mean.norm() >= MIN_UPRIGHT).then(|| mean.normalize())
     }
 
     /// Whether images see enough points, each seen by three images at least, to tell their camera though they are few.

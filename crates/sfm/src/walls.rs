@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use setloc_features::{Camera, ImagePyramid, Patch, PatchFrame, PatchParams, Template};
 
 use crate::{
-    ImageId, Place, PointId, Reconstruction, Rigid,
+    ImageId, Place, PointId, Reconstruction, ReconstructionPoint, Rigid,
     ground::{
         PATCH,
         floor::Ground,
@@ -25,10 +25,9 @@ use crate::{
 
 /// Fewest points of a wall.
 const MIN_WALL_POINTS: usize = 20;
-/// Largest cosine between the normal of a wall and what the images take for down, and least mean of the images' vertical
-/// axes where they tell it. The ground repeats itself, and seen at a grazing angle any of it is like the next.
+/// Largest cosine between the normal of a wall and down. The ground repeats itself, and seen at a grazing angle any of it is
+/// like the next.
 const MAX_LYING: f64 = 0.7;
-const MIN_UPRIGHT: f64 = 0.9;
 /// How far a wall goes on beyond its points, as an angle about its image, in cells.
 const CELL_RAD: f64 = 0.03;
 const BEYOND: i64 = 2;
@@ -220,12 +219,12 @@ impl<'a> Look<'a> {
     ) -> Option<Self> {
         let world_from_camera = scene.images.get(image.index())?.world_from_camera?;
         let center = world_from_camera.translation;
-        let seen = |(at, point): (usize, &crate::ReconstructionPoint)| {
+        let seen = |(at, point): (usize, &ReconstructionPoint)| {
             let is_seen = point.track.iter().any(|seen| seen.image == image);
             is_seen.then(|| SeenPoint::known(point.position - center, covariance(PointId(at as u32))))?
         };
         let points: Vec<SeenPoint> = scene.points.iter().enumerate().filter_map(seen).collect();
-        let down = down_of(scene);
+        let down = scene.down();
         let is_wall = |plane: &Plane| down.is_none_or(|down| plane.normal.dot(&down).abs() <= MAX_LYING);
         let planes = find_planes(&points, MIN_WALL_POINTS, SEED).into_iter().filter(is_wall);
         let walls = planes.map(|plane| {
@@ -265,14 +264,6 @@ impl<'a> Look<'a> {
         });
         met.reduce(|a, b| if b.1 < a.1 { b } else { a })
     }
-}
-
-/// The direction down, where the images stand upright.
-fn down_of(scene: &Reconstruction) -> Option<Vector3<f64>> {
-    let poses = scene.images.iter().filter_map(|image| image.world_from_camera);
-    let axes: Vec<Vector3<f64>> = poses.map(|pose| pose.rotation * Vector3::y()).collect();
-    let mean = axes.iter().sum::<Vector3<f64>>() / axes.len().max(1) as f64;
-    (mean.norm() >= MIN_UPRIGHT).then(|| mean.normalize())
 }
 
 struct Sweep<'a> {

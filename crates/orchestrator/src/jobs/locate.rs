@@ -7,7 +7,7 @@ use setloc_camset::{
     AnywhereLocalization, LocalModels, QueryPhoto, Scene, SetLocalization, SingleLocalization, Views,
     likely_images, locate_set_anywhere, locate_single_anywhere, match_views,
 };
-use setloc_features::ImageFeatures;
+use setloc_features::{Camera, ImageFeatures};
 use setloc_index::SceneIndex;
 use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
 
@@ -76,7 +76,7 @@ pub fn add_set(
         name: name.to_owned(),
         params,
         external: BTreeMap::from([("scene".to_owned(), what.scene.content)]),
-        memory: 64 << 20,
+        memory: (64 << 20) + memory_of_pictures(what),
         work: Box::new(work),
     });
     graph.require(set, "local_model", model.model);
@@ -85,6 +85,14 @@ pub fn add_set(
         graph.accept(set, single_role(at), *single);
     }
     Ok(SetJobs { model, single, set })
+}
+
+/// Of the largest images of the scene that may be looked at together, and of one that is decoded.
+fn memory_of_pictures(what: &LocateJobs) -> u64 {
+    const BYTES_A_PIXEL: u64 = 16;
+    let pixels = |camera: &Camera| u64::from(camera.width) * u64::from(camera.height);
+    let largest = what.scene.components.iter().flat_map(|model| &model.cameras).map(pixels).max();
+    if what.pictures.is_empty() { 0 } else { BYTES_A_PIXEL * largest.unwrap_or(0) }
 }
 
 fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -> Result<Product> {
