@@ -46,13 +46,14 @@ impl PicturesAtHand {
             let (path, hash, wraps) = match picture {
                 Picture::Photo(at) => photos.get(at).map(|(path, hash)| (path, *hash, false))?,
                 Picture::Scene(image) => {
-                    let file = files.get(image.index())?.as_ref()?;
-                    (&file.0, file.1, file.2)
+                    let (path, hash, wraps) = files.get(image.index())?.as_ref()?;
+                    (path, *hash, *wraps)
                 }
             };
             let read = pyramids.get((path, hash), wraps);
             read.map_err(|error| {
-                let text = format!("{error:#}: its pixels tell nothing");
+                let text =
+                    format!("{} is not looked at, since it is not what it was: {error:#}", path.display());
                 let mut failures = failures.lock().unwrap_or_else(PoisonError::into_inner);
                 if !failures.contains(&text) {
                     failures.push(text);
@@ -67,5 +68,56 @@ impl PicturesAtHand {
         let mut failures = self.failures.lock().unwrap_or_else(PoisonError::into_inner).clone();
         failures.sort();
         failures
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use setloc_features::Camera;
+    use setloc_index::SceneIndex;
+    use setloc_sfm::{CameraId, ImageId, Reconstruction, ReconstructionImage};
+
+    use super::*;
+
+    #[test]
+    fn an_image_that_is_not_what_it_was_is_named_and_not_looked_at() {
+        let root = tempfile::tempdir().unwrap();
+        let camera = Camera::equirectangular(256, 128);
+        let source = |name: &str, grey: u8| {
+            let path = root.path().join(name);
+            image::GrayImage::from_pixel(256, 128, image::Luma([grey])).save(&path).unwrap();
+            let hash = ContentHash::of(&std::fs::read(&path).unwrap());
+            SourceImage { path, hash, ..SourceImage::guessed(name, camera.clone()) }
+        };
+        let [kept, changed] = ["a.png", "b.png"].map(|name| source(name, 80));
+        let book = Arc::new(PictureBook::of(&[kept.clone(), changed.clone()]));
+        source("b.png", 90);
+        let listed = |name: &str| ReconstructionImage {
+            name: name.to_owned(),
+            camera: CameraId(0),
+            world_from_camera: None,
+        };
+        let reconstruction = Reconstruction {
+            cameras: vec![camera.clone()],
+            images: ["a.png", "b.png", "c.png"].map(listed).to_vec(),
+            ..Reconstruction::default()
+        };
+        let scene = Scene {
+            component: 0,
+            is_placed: false,
+            reconstruction: &reconstruction,
+            index: &SceneIndex::default(),
+            grown: &[],
+            doubtful: &[],
+        };
+        let at_hand = PicturesAtHand::new(&book, &[&kept]);
+        let pictures = at_hand.of(&scene);
+        let is_there = |picture| pictures.get(picture).is_some();
+        assert!(is_there(Picture::Photo(0)) && !is_there(Picture::Photo(1)));
+        assert_eq!([0, 1, 2, 3].map(|at| is_there(Picture::Scene(ImageId(at)))), [true, false, false, false]);
+        let [failure] = &at_hand.failures()[..] else { panic!("{:?}", at_hand.failures()) };
+        assert!(failure.contains("b.png is not looked at"), "{failure}");
+        // Without any of the scene's images there is nothing to lay photos over.
+        assert!(!PicturesAtHand::new(&Arc::default(), &[&kept]).of(&scene).are_some());
     }
 }
