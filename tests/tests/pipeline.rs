@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -162,24 +162,27 @@ fn photos_localized_earlier_localize_one_that_the_panoramas_do_not() {
     assert!(apart < 0.01 * baseline, "{apart} of {baseline}");
 }
 
+/// A data set that is not ours, beside the project; says that a test is skipped where it is not there.
+#[allow(clippy::print_stdout, reason = "tests may print, and so may their helpers")]
+fn shared(name: &str) -> Option<PathBuf> {
+    let dataset = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data").join(name);
+    let is_there = dataset.join("cameras.json").is_file();
+    if !is_there {
+        println!("skipped: {} is not present", dataset.display());
+    }
+    is_there.then_some(dataset)
+}
+
 #[test]
 fn the_small_rendered_street_is_mapped_and_its_set_located() {
-    let dataset = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/small");
-    if !dataset.join("truth.json").is_file() {
-        println!("skipped: {} is not present", dataset.display());
-        return;
-    }
+    let Some(dataset) = shared("small") else { return };
     assert_main_job(&bench(&dataset));
 }
 
 /// Of these photos along a wall one sees the scene by keypoints; two of its neighbours show a slice of a façade across the street.
 #[test]
 fn a_real_set_of_which_one_standpoint_sees_the_scene_gets_its_scale_from_a_facade() {
-    let dataset = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data/lzr");
-    if !dataset.join("cameras.json").is_file() {
-        println!("skipped: {} is not present", dataset.display());
-        return;
-    }
+    let Some(dataset) = shared("lzr") else { return };
     let localized = |scale_by_walls: bool| {
         let mut config = Config::default();
         config.camset.scale_by_walls = scale_by_walls;
