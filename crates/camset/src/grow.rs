@@ -333,7 +333,15 @@ mod tests {
 
     fn scene_of(grown: &GrownScene) -> Scene<'_> {
         let (reconstruction, index) = (&grown.reconstruction, &grown.index);
-        Scene { component: 0, is_placed: false, reconstruction, index, grown: &grown.grown, doubtful: &[] }
+        Scene {
+            component: 0,
+            is_placed: false,
+            reconstruction,
+            index,
+            grown: &grown.grown,
+            doubtful: &[],
+            shared_errors: None,
+        }
     }
 
     #[test]

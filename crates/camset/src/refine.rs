@@ -11,6 +11,7 @@ use setloc_sfm::bundle::{
 };
 use setloc_sfm::{ImageId, Place, PointId, Rigid, WallSight};
 
+use crate::bearing_errors::HeldByScene;
 use crate::common::{CommonErrors, PoseError, shift_of_point};
 use crate::evidence::{PhotoRays, ray_error_sigmas};
 use crate::jackknife::honest_covariances;
@@ -204,13 +205,14 @@ pub(crate) fn refine_jointly(
         .collect();
     let mut cameras: Vec<Camera> = model.cameras.iter().map(|known| known.camera.clone()).collect();
     cameras.push(sphere());
-    let mut common = CommonErrors::default();
+    let (mut common, mut held) = (CommonErrors::default(), HeldByScene::default());
     for &ScenePrior { point, scene_point, ref covariance } in &priors {
         let shift = scene_point.and_then(|point| shift_of_point(scene, point));
         for prior in prior_bearings(&points[point as usize].position, covariance) {
             let pose = poses.len() as u32;
             let camera = model.cameras.len() as u32;
             common.far.extend(shift.map(|shift| (pose, shift)));
+            held.far.extend(scene_point.map(|point| (pose, point)));
             poses.push(BundlePose { camera, world_from_camera: prior.world_from_camera, fixed: true });
             let PriorBearing { pixel, noise_px, .. } = prior;
             observations.push(BundleObservation { pose, point, pixel, noise_px });
@@ -228,6 +230,7 @@ pub(crate) fn refine_jointly(
             poses.push(BundlePose { camera: cameras.len() as u32, world_from_camera, fixed: true });
             cameras.push(camera.clone());
             common.views.extend(error.map(|error| (pose, error)));
+            held.views.insert(pose, view.image);
             pose
         });
         let Place { pixel, mut noise_px } = view.place;
@@ -260,10 +263,12 @@ pub(crate) fn refine_jointly(
         of_leads = honest_covariances(&params, &mut problem, photos, |problem, loss| {
             covariances(problem, photos, loss)
         });
-        for (covariance, common) in
-            of_leads.iter_mut().zip(common.spread(&params, &problem, photos).unwrap_or_default())
-        {
-            *covariance = covariance.map(|own| own + common);
+        let considered =
+            [common.spread(&params, &problem, photos), held.spread(scene, &params, &problem, photos)];
+        for added in considered.into_iter().flatten() {
+            for (covariance, added) in of_leads.iter_mut().zip(added) {
+                *covariance = covariance.map(|own| own + added);
+            }
         }
     }
     for (JointCamera { camera, .. }, refined) in model.cameras.iter_mut().zip(&problem.cameras) {

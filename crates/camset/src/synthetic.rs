@@ -389,7 +389,15 @@ impl World {
     /// The panoramas' model and its index.
     pub fn scene(&self) -> Scene<'_> {
         let (reconstruction, index) = (&self.scene_model, &self.index);
-        Scene { component: 0, is_placed: false, reconstruction, index, grown: &[], doubtful: &[] }
+        Scene {
+            component: 0,
+            is_placed: false,
+            reconstruction,
+            index,
+            grown: &[],
+            doubtful: &[],
+            shared_errors: None,
+        }
     }
 
     /// The photos, intrinsics known.

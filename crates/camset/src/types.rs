@@ -2,7 +2,9 @@ use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Calibration, Camera, ImageFeatures};
 use setloc_index::{NearestPoints, SceneIndex};
-use setloc_sfm::{ImageId, OutvotedPair, PairGeometry, PointId, Reconstruction, Rigid, Similarity};
+use setloc_sfm::{
+    ImageId, OutvotedPair, PairGeometry, PointId, Reconstruction, Rigid, SharedErrors, Similarity,
+};
 
 use crate::PathToScene;
 
@@ -21,6 +23,8 @@ pub struct Scene<'a> {
     pub grown: &'a [GrownImage],
     /// Images about which it may be folded ([`setloc_sfm::doubtful_images`]); ascending.
     pub doubtful: &'a [ImageId],
+    /// Errors that directions of its images share, where any are told.
+    pub shared_errors: Option<&'a SharedErrors>,
 }
 
 impl Scene<'_> {

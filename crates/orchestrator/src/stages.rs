@@ -30,8 +30,9 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// 4: notes. 6: models state lengths that their points do not tell. 7: and the poses at
 /// their ends. 8: holds features of its images. 9: half as many.
 /// 10: says which images it has grown by. 11: an index for each component, features of all their images, and which of
-/// them are placed. 12: about which images it may be folded.
-pub const SCENE_VERSION: u32 = 12;
+/// them are placed. 12: about which images it may be folded. 13: which
+/// errors its images share.
+pub const SCENE_VERSION: u32 = 13;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
 /// Version of set localization.

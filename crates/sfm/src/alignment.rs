@@ -217,7 +217,7 @@ pub(crate) fn second_order(
 }
 
 /// Whether two images have one centre, as photos turned on the spot do.
-fn shares_standpoints(component: &Reconstruction, registered: &[ImageId]) -> bool {
+pub(crate) fn shares_standpoints(component: &Reconstruction, registered: &[ImageId]) -> bool {
     let mut centers: Vec<[f64; 3]> = registered
         .iter()
         .filter_map(|image| Some(component.images[image.index()].world_from_camera?.translation.into()))

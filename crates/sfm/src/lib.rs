@@ -14,6 +14,7 @@ mod mapper;
 mod quality;
 mod reconstruction;
 pub mod robust;
+mod shared_errors;
 pub mod solvers;
 pub mod synthetic;
 mod two_view;
@@ -36,5 +37,6 @@ pub use reconstruction::{
     AlignedTrack, BaselineLength, CameraId, ImageId, Observation, Place, PointId, Reconstruction,
     ReconstructionImage, ReconstructionPoint, StepPose,
 };
+pub use shared_errors::{BearingField, SharedErrors};
 pub use two_view::{PairGeometry, TWO_VIEW_VERSION, TwoView, TwoViewKind, TwoViewParams, verify_pair};
 pub use walls::{DistantPhoto, ScaleByWalls, WallSight, scale_by_walls};

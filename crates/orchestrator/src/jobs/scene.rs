@@ -6,7 +6,7 @@ use serde_json::json;
 use setloc_features::{GeoPosition, ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
 use setloc_sfm::{
-    ImageId, MapperOutput, MeasuredPosition, MergeRecord, Reconstruction, ReconstructionImage,
+    ImageId, MapperOutput, MeasuredPosition, MergeRecord, Reconstruction, ReconstructionImage, SharedErrors,
     doubtful_images,
 };
 
@@ -184,10 +184,15 @@ pub fn add_scene(
             .zip(&doubtful)
             .filter_map(|(component, images)| doubt(component, images))
             .collect();
+        let shared_errors: Vec<Option<SharedErrors>> =
+            output.components.iter().map(SharedErrors::of_model).collect();
+        let notes_of_errors: Vec<String> =
+            shared_errors.iter().enumerate().filter_map(shared_errors_note).collect();
         Product::new(SceneFile {
             components,
             indices: copy,
             doubtful,
+            shared_errors,
             placed: georegistrations().map(|is_placed| is_placed && origin.is_some()).collect(),
             features,
             origin,
@@ -200,6 +205,7 @@ pub fn add_scene(
                 .chain(recall.as_ref().map(Recall::note))
                 .chain(fixes.as_deref().map(|fixes| positions::note(fixes, listed)))
                 .chain(relative)
+                .chain(notes_of_errors)
                 .collect(),
             config: config.clone(),
             grown: Vec::new(),
@@ -226,6 +232,17 @@ pub fn add_scene(
         features[at] = job;
     }
     Ok(SceneJobs { features, model: jobs.model, scene })
+}
+
+/// Says what errors the images of a component share, where any are told.
+fn shared_errors_note((component, errors): (usize, &Option<SharedErrors>)) -> Option<String> {
+    let degrees = errors.as_ref()?.sigma_rad().to_degrees();
+    let of_component =
+        if component == 0 { String::new() } else { format!(" in component {}", component + 1) };
+    Some(format!(
+        "neighbouring bearings of an image{of_component} are off together by {degrees:.3}° (stitching, lenses), which \
+         covariances of photos have in them"
+    ))
 }
 
 /// Says what images about which a model may be folded mean for photos.

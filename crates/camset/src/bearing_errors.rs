@@ -1,0 +1,194 @@
+//! Errors of bearings that neighbouring directions of a scene's image share ([`setloc_sfm::SharedErrors`]).
+//!
+//! Scene points of one region are off together, by the errors of the images that see them there and of the poses of these, and so
+//! is a photo that sees little else. As in [`crate::common`] these errors are *considered* rather than estimated: for each draw of
+//! them the photos are adjusted again, and what their poses move by in the mean of the draws is added to their covariances.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{Matrix3, Matrix6, Vector3};
+use rayon::prelude::*;
+use setloc_sfm::bundle::{self, BundleParams, BundleProblem};
+use setloc_sfm::{BearingField, ImageId, PointId, SharedErrors};
+
+use crate::Scene;
+use crate::jackknife::deviation;
+
+/// Least information of a point along an axis, as a share of that along its best.
+const LEAST_INFORMATION: f64 = 1e-4;
+
+/// What of a bundle problem hangs on images of the scene.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct HeldByScene {
+    /// Far cameras that hold scene points, which shift with their point.
+    pub far: Vec<(u32, PointId)>,
+    /// Poses that are images of the scene.
+    pub views: BTreeMap<u32, ImageId>,
+}
+
+impl HeldByScene {
+    /// What shared errors add to the covariances of the first poses of an adjusted problem; `None` when there are none.
+    pub(crate) fn spread(
+        &self,
+        scene: &Scene<'_>,
+        params: &BundleParams,
+        problem: &BundleProblem,
+        poses: usize,
+    ) -> Option<Vec<Matrix6<f64>>> {
+        let errors = scene.shared_errors.filter(|errors| errors.draws() > 0)?;
+        if self.far.is_empty() && self.views.is_empty() {
+            return None;
+        }
+        let draws: Vec<u32> = (0..errors.draws()).collect();
+        let deviations = |&draw: &u32| {
+            let mut moved = problem.clone();
+            self.apply(&Draw::new(scene, errors, draw), &mut moved);
+            bundle::solve(params, &mut moved);
+            let pairs = problem.poses.iter().zip(&moved.poses).take(poses);
+            pairs.map(|(a, b)| deviation(&a.world_from_camera, &b.world_from_camera)).collect::<Vec<_>>()
+        };
+        let moved: Vec<_> = draws.par_iter().with_max_len(1).map(deviations).collect();
+        let of_pose = |pose: usize| {
+            let squared = moved.iter().map(|draw| draw[pose] * draw[pose].transpose());
+            squared.sum::<Matrix6<f64>>() / f64::from(errors.draws())
+        };
+        Some((0..poses).map(of_pose).collect())
+    }
+
+    fn apply(&self, draw: &Draw<'_>, problem: &mut BundleProblem) {
+        for &(pose, point) in &self.far {
+            let shift = draw.shift_of(point).unwrap_or_default();
+            problem.poses[pose as usize].world_from_camera.translation += shift;
+        }
+        for (&pose, &image) in &self.views {
+            let pose = &mut problem.poses[pose as usize].world_from_camera;
+            *pose = draw.errors.pose(image, draw.number).unwrap_or(*pose);
+        }
+        for seen in &mut problem.observations {
+            let field = self.views.get(&seen.pose).and_then(|image| draw.fields.get(image));
+            let camera = &problem.cameras[problem.poses[seen.pose as usize].camera as usize];
+            seen.pixel = field.and_then(|field| field.moved(camera, &seen.pixel)).unwrap_or(seen.pixel);
+        }
+    }
+}
+
+/// One draw of the errors.
+struct Draw<'a> {
+    scene: &'a Scene<'a>,
+    errors: &'a SharedErrors,
+    number: u32,
+    fields: BTreeMap<ImageId, BearingField>,
+}
+
+impl<'a> Draw<'a> {
+    fn new(scene: &'a Scene<'a>, errors: &'a SharedErrors, number: u32) -> Self {
+        let fields =
+            scene.reconstruction.registered().map(|image| (image, errors.field(image, number))).collect();
+        Self { scene, errors, number, fields }
+    }
+
+    /// How far a scene point shifts: to where the moved rays to it meet.
+    fn shift_of(&self, point: PointId) -> Option<Vector3<f64>> {
+        let scene = self.scene.reconstruction;
+        let found = scene.points.get(point.index())?;
+        let (mut information, mut pull) = (Matrix3::zeros(), Vector3::zeros());
+        for seen in &found.track {
+            let Some(pose) = scene.images.get(seen.image.index())?.world_from_camera else { continue };
+            let Some(field) = self.fields.get(&seen.image) else { continue };
+            let offset = found.position - pose.translation;
+            let distance = offset.norm();
+            let Some(direction) = offset.try_normalize(f64::EPSILON) else { continue };
+            let across = (Matrix3::identity() - direction * direction.transpose()) / distance.powi(2);
+            let bearing = pose.rotation.inverse() * direction;
+            let moved = self.errors.pose(seen.image, self.number).unwrap_or(pose);
+            let there = moved.translation + moved.rotation * (bearing + field.at(&bearing)) * distance;
+            information += across;
+            pull += across * (there - found.position);
+        }
+        let eigen = information.symmetric_eigen();
+        let least = LEAST_INFORMATION * eigen.eigenvalues.max();
+        let inverse = eigen.eigenvalues.map(|along| 1.0 / along.max(least));
+        let axes = eigen.eigenvectors;
+        (least > 0.0).then(|| axes * Matrix3::from_diagonal(&inverse) * axes.transpose() * pull)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::synthetic::World;
+    use setloc_sfm::Rigid;
+    use setloc_sfm::solvers::triangulation::{WorldRay, triangulate};
+
+    /// Panoramas that a draw moves by a common turn and shift.
+    fn moved_together(world: &World, draws: usize) -> (Rigid, Vec<Vec<Option<Rigid>>>) {
+        let turn = nalgebra::UnitQuaternion::from_euler_angles(0.001, 0.002, -0.001);
+        let motion = Rigid::new(turn, Vector3::new(0.02, -0.01, 0.03));
+        let images = &world.scene().reconstruction.images;
+        let moved = |pose: &Rigid| {
+            Rigid::new(motion.rotation * pose.rotation, motion.transform_point(&pose.translation))
+        };
+        let poses = images.iter().map(|image| image.world_from_camera.as_ref().map(moved)).collect();
+        (motion, vec![poses; draws])
+    }
+
+    #[test]
+    fn points_go_where_their_panoramas_go() {
+        let world = World::chain(1, 0.0, 71);
+        let (motion, poses) = moved_together(&world, 1);
+        let errors = SharedErrors::new(0.0, poses);
+        let scene = world.scene();
+        let draw = Draw::new(&scene, &errors, 0);
+        for (at, point) in scene.reconstruction.points.iter().enumerate().take(200) {
+            let expected = motion.transform_point(&point.position) - point.position;
+            let shift = draw.shift_of(PointId(at as u32)).unwrap();
+            assert!((shift - expected).norm() < 0.05 * expected.norm(), "{at}: {shift} {expected}");
+        }
+    }
+
+    #[test]
+    fn points_go_where_rays_with_errors_meet() {
+        let world = World::chain(1, 0.0, 72);
+        let errors = SharedErrors::new(1e-3, vec![Vec::new()]);
+        let scene = world.scene();
+        let draw = Draw::new(&scene, &errors, 0);
+        let mut moved = 0;
+        for (at, point) in scene.reconstruction.points.iter().enumerate().take(200) {
+            let rays: Vec<WorldRay> = point
+                .track
+                .iter()
+                .map(|seen| {
+                    let pose = scene.reconstruction.images[seen.image.index()].world_from_camera.unwrap();
+                    let bearing = pose.inverse().transform_point(&point.position).normalize();
+                    let off = errors.field(seen.image, 0).at(&bearing);
+                    WorldRay::new(&pose, &(bearing + off).normalize(), 1e-3)
+                })
+                .collect();
+            let Some(met) = triangulate(&rays) else { continue };
+            let (expected, shift) = (met - point.position, draw.shift_of(PointId(at as u32)).unwrap());
+            moved += usize::from((shift - expected).norm() < 0.1 * expected.norm());
+        }
+        assert!(moved > 180, "{moved}");
+    }
+
+    #[test]
+    fn what_all_panoramas_share_is_in_the_covariance_of_a_photo_beside_them() {
+        let world = World::chain(2, 0.2, 73);
+        let alone = |errors: Option<&SharedErrors>| {
+            let scene = Scene { shared_errors: errors, ..world.scene() };
+            let photo = world.queries()[0];
+            let found = crate::locate_single(&crate::SingleParams::default(), &scene, &photo, 1);
+            found.photo.covariance.expect("is localized")
+        };
+        let (motion, poses) = moved_together(&world, 16);
+        let errors = SharedErrors::new(0.0, poses);
+        let added = alone(Some(&errors)) - alone(None);
+        // A common motion moves the photo as a point of the scene; sixteen equal draws are one standard deviation.
+        let center = world.photos[0].pose.translation;
+        let shift = motion.transform_point(&center) - center;
+        let expected = shift * shift.transpose();
+        let center = added.fixed_view::<3, 3>(3, 3).into_owned();
+        assert!((center - expected).norm() < 0.1 * expected.norm(), "{center} {expected}");
+        assert_eq!(alone(Some(&SharedErrors::new(1.0, Vec::new()))), alone(None));
+    }
+}
