@@ -43,18 +43,25 @@ impl PictureBook {
         Self(images.iter().map(file).collect())
     }
 
-    /// Those of a scene that are where they were; none where nothing says where they were.
+    /// Those of a scene; none where nothing says where they were.
     ///
     /// # Errors
     /// When the file that says it is damaged.
     pub fn read(scene: &Path) -> Result<Self> {
         let path = beside(scene);
         let Ok(bytes) = std::fs::read(&path) else { return Ok(Self::default()) };
-        let book: Self = serde_json::from_slice(&bytes).map_err(|error| {
+        serde_json::from_slice(&bytes).map_err(|error| {
             let error = anyhow::Error::new(error).context(format!("{} is not readable", path.display()));
             Hinted::wrap(error, "build the scene again, or remove the file to do without its images' pixels")
-        })?;
-        Ok(Self(book.0.into_iter().filter(|(_, file)| file.path.is_file()).collect()))
+        })
+    }
+
+    /// Those that are where they were.
+    #[must_use]
+    pub fn at_hand(&self) -> Self {
+        let is_there = |(_, file): &(&String, &PictureFile)| file.path.is_file();
+        let there = self.0.iter().filter(is_there);
+        Self(there.map(|(name, file)| (name.clone(), file.clone())).collect())
     }
 
     /// Writes it beside a scene, if that does not say the same.
@@ -116,7 +123,8 @@ mod tests {
         assert!(root.path().join("street.images.json").is_file());
         assert_eq!(PictureBook::read(&scene).unwrap(), book);
         std::fs::remove_file(gone).unwrap();
-        let left = PictureBook::read(&scene).unwrap();
+        assert_eq!(PictureBook::read(&scene).unwrap(), book, "they may come back");
+        let left = book.at_hand();
         assert_eq!(left.get("a.jpg").map(|file| file.hash), Some(ContentHash::of(b"a")));
         assert!(left.get("b.jpg").is_none() && left.content() != book.content());
     }
