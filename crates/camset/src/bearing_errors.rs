@@ -4,7 +4,7 @@
 //! is a photo that sees little else. As in [`crate::common`] these errors are *considered* rather than estimated: for each draw of
 //! them the photos are adjusted again, and what their poses move by in the mean of the draws is added to their covariances.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use rayon::prelude::*;
@@ -20,8 +20,8 @@ const LEAST_INFORMATION: f64 = 1e-4;
 /// What of a bundle problem hangs on images of the scene.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct HeldByScene {
-    /// Far cameras that hold scene points, which shift with their point.
-    pub far: Vec<(u32, PointId)>,
+    /// Far cameras that hold each scene point, which shift with it.
+    pub far: BTreeMap<PointId, Vec<u32>>,
     /// Poses that are images of the scene.
     pub views: BTreeMap<u32, ImageId>,
 }
@@ -39,10 +39,11 @@ impl HeldByScene {
         if self.far.is_empty() && self.views.is_empty() {
             return None;
         }
+        let images = self.images(scene);
         let draws: Vec<u32> = (0..errors.draws()).collect();
         let deviations = |&draw: &u32| {
             let mut moved = problem.clone();
-            self.apply(&Draw::new(scene, errors, draw), &mut moved);
+            self.apply(&Draw::new(scene, errors, draw, &images), &mut moved);
             bundle::solve(params, &mut moved);
             let pairs = problem.poses.iter().zip(&moved.poses).take(poses);
             pairs.map(|(a, b)| deviation(&a.world_from_camera, &b.world_from_camera)).collect::<Vec<_>>()
@@ -55,10 +56,19 @@ impl HeldByScene {
         Some((0..poses).map(of_pose).collect())
     }
 
+    /// The images that see any of it.
+    fn images(&self, scene: &Scene<'_>) -> BTreeSet<ImageId> {
+        let points = self.far.keys().filter_map(|point| scene.reconstruction.points.get(point.index()));
+        let see = points.flat_map(|point| point.track.iter().map(|seen| seen.image));
+        see.chain(self.views.values().copied()).collect()
+    }
+
     fn apply(&self, draw: &Draw<'_>, problem: &mut BundleProblem) {
-        for &(pose, point) in &self.far {
+        for (&point, poses) in &self.far {
             let shift = draw.shift_of(point).unwrap_or_default();
-            problem.poses[pose as usize].world_from_camera.translation += shift;
+            for &pose in poses {
+                problem.poses[pose as usize].world_from_camera.translation += shift;
+            }
         }
         for (&pose, &image) in &self.views {
             let pose = &mut problem.poses[pose as usize].world_from_camera;
@@ -81,9 +91,8 @@ struct Draw<'a> {
 }
 
 impl<'a> Draw<'a> {
-    fn new(scene: &'a Scene<'a>, errors: &'a SharedErrors, number: u32) -> Self {
-        let fields =
-            scene.reconstruction.registered().map(|image| (image, errors.field(image, number))).collect();
+    fn new(scene: &'a Scene<'a>, errors: &'a SharedErrors, number: u32, images: &BTreeSet<ImageId>) -> Self {
+        let fields = images.iter().map(|&image| (image, errors.field(image, number))).collect();
         Self { scene, errors, number, fields }
     }
 
@@ -138,7 +147,8 @@ mod tests {
         let (motion, poses) = moved_together(&world, 1);
         let errors = SharedErrors::new(0.0, poses);
         let scene = world.scene();
-        let draw = Draw::new(&scene, &errors, 0);
+        let images = scene.reconstruction.registered().collect();
+        let draw = Draw::new(&scene, &errors, 0, &images);
         for (at, point) in scene.reconstruction.points.iter().enumerate().take(200) {
             let expected = motion.transform_point(&point.position) - point.position;
             let shift = draw.shift_of(PointId(at as u32)).unwrap();
@@ -151,7 +161,8 @@ mod tests {
         let world = World::chain(1, 0.0, 72);
         let errors = SharedErrors::new(1e-3, vec![Vec::new()]);
         let scene = world.scene();
-        let draw = Draw::new(&scene, &errors, 0);
+        let images = scene.reconstruction.registered().collect();
+        let draw = Draw::new(&scene, &errors, 0, &images);
         let mut moved = 0;
         for (at, point) in scene.reconstruction.points.iter().enumerate().take(200) {
             let rays: Vec<WorldRay> = point

@@ -212,7 +212,9 @@ pub(crate) fn refine_jointly(
             let pose = poses.len() as u32;
             let camera = model.cameras.len() as u32;
             common.far.extend(shift.map(|shift| (pose, shift)));
-            held.far.extend(scene_point.map(|point| (pose, point)));
+            if let Some(point) = scene_point {
+                held.far.entry(point).or_default().push(pose);
+            }
             poses.push(BundlePose { camera, world_from_camera: prior.world_from_camera, fixed: true });
             let PriorBearing { pixel, noise_px, .. } = prior;
             observations.push(BundleObservation { pose, point, pixel, noise_px });
@@ -230,7 +232,6 @@ pub(crate) fn refine_jointly(
             poses.push(BundlePose { camera: cameras.len() as u32, world_from_camera, fixed: true });
             cameras.push(camera.clone());
             common.views.extend(error.map(|error| (pose, error)));
-            held.views.insert(pose, view.image);
             pose
         });
         let Place { pixel, mut noise_px } = view.place;
@@ -240,6 +241,7 @@ pub(crate) fn refine_jointly(
         observations.push(BundleObservation { pose, point: *point as u32, pixel, noise_px });
         origins.push(Origin::Scene);
     }
+    held.views = pose_of_view.into_iter().map(|(image, pose)| (pose, image)).collect();
     let mut problem = BundleProblem {
         cameras,
         camera_freedom,

@@ -216,6 +216,22 @@ pub(crate) fn second_order(
     Some(PatchFrame { center, pixel_from_patch, curvature })
 }
 
+/// Poses of the registered images, and each image's among them: free but for the first and those that see too little.
+pub(crate) fn adjustable_poses(
+    component: &Reconstruction,
+    seen: impl Fn(ImageId) -> usize,
+) -> (Vec<BundlePose>, Vec<Option<u32>>) {
+    let (mut poses, mut pose_of_image) = (Vec::new(), vec![None; component.images.len()]);
+    for (index, image) in component.images.iter().enumerate() {
+        if let Some(world_from_camera) = image.world_from_camera {
+            pose_of_image[index] = Some(poses.len() as u32);
+            let fixed = poses.is_empty() || seen(ImageId(index as u32)) < MIN_ADJUSTABLE_POINTS;
+            poses.push(BundlePose { camera: image.camera.0, world_from_camera, fixed });
+        }
+    }
+    (poses, pose_of_image)
+}
+
 /// Whether two images have one centre, as photos turned on the spot do.
 pub(crate) fn shares_standpoints(component: &Reconstruction, registered: &[ImageId]) -> bool {
     let mut centers: Vec<[f64; 3]> = registered
@@ -476,15 +492,11 @@ impl<'a> Tracks<'a> {
             camera_freedom: vec![IntrinsicsFreedom::FIXED; component.cameras.len()],
             ..BundleProblem::default()
         };
-        let mut pose_of_image = vec![None; component.images.len()];
+        let pose_of_image;
+        (problem.poses, pose_of_image) = adjustable_poses(component, |image| self.seen[image.index()].len());
         let mut users = vec![Vec::new(); component.cameras.len()];
-        for (index, image) in component.images.iter().enumerate() {
-            if let Some(world_from_camera) = image.world_from_camera {
-                pose_of_image[index] = Some(problem.poses.len() as u32);
-                let fixed = problem.poses.is_empty() || self.seen[index].len() < MIN_ADJUSTABLE_POINTS;
-                problem.poses.push(BundlePose { camera: image.camera.0, world_from_camera, fixed });
-                users[image.camera.index()].push(ImageId(index as u32));
-            }
+        for image in component.registered() {
+            users[component.images[image.index()].camera.index()].push(image);
         }
         for (camera, freedom) in problem.camera_freedom.iter_mut().enumerate() {
             let is_told = || users[camera].len() >= 2 || component.tells_camera_of(&users[camera]);

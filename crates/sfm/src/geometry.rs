@@ -2,4 +2,4 @@ mod rigid;
 mod similarity;
 
 pub use rigid::Rigid;
-pub use similarity::Similarity;
+pub use similarity::{Similarity, nearest_rotation};

@@ -22,7 +22,7 @@ mod visibility;
 mod walls;
 
 pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, align_tracks};
-pub use geometry::{Rigid, Similarity};
+pub use geometry::{Rigid, Similarity, nearest_rotation};
 pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, georegister};
 pub use ground::{register_by_ground, sharpen_lengths};
 pub use mapper::{

@@ -6,20 +6,18 @@
 //! keypoints. How large these errors are, residuals of neighbouring points show: where noise is independent, their products are
 //! zero in the mean. What they do, draws of such errors show, for each of which the model is adjusted again.
 
-use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Matrix3, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::alignment::shares_standpoints;
+use crate::alignment::{adjustable_poses, shares_standpoints};
 use crate::bundle::{
-    self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, IntrinsicsFreedom,
-    RobustLoss,
+    self, BundleObservation, BundleParams, BundlePoint, BundleProblem, IntrinsicsFreedom, RobustLoss,
 };
-use crate::mapper::MIN_ADJUSTABLE_POINTS;
 use crate::synthetic::normal;
-use crate::{ImageId, Reconstruction, ReconstructionPoint, Rigid, Similarity};
+use crate::{ImageId, Place, Reconstruction, ReconstructionPoint, Rigid, Similarity, nearest_rotation};
 
 /// Angles in radians between directions whose residuals are compared: nearer ones share pixels of their patches.
 const APART: [f64; 2] = [0.026, 0.087];
@@ -57,7 +55,8 @@ impl SharedErrors {
     ///
     /// Intrinsics stay as they are. What whole hemispheres share is not in it, as the poses take it up.
     pub fn of_model(model: &Reconstruction) -> Option<Self> {
-        if shares_standpoints(model, &model.registered().collect::<Vec<_>>()) {
+        let images: Vec<ImageId> = model.registered().collect();
+        if shares_standpoints(model, &images) {
             return None;
         }
         let Variances { shared, all } = variances(model)?;
@@ -65,7 +64,7 @@ impl SharedErrors {
             return None;
         }
         let sigma_rad = shared.sqrt();
-        let (mut problem, images) = problem_of(model);
+        let mut problem = problem_of(model);
         let params = BundleParams { loss: RobustLoss::Cauchy(1.0), ..BundleParams::default() };
         bundle::solve(&params, &mut problem);
         let of_draw = |draw: u32| {
@@ -239,38 +238,37 @@ fn residuals<'a>(
     })
 }
 
-/// The model by its aligned places, with the images of its poses.
-fn problem_of(model: &Reconstruction) -> (BundleProblem, Vec<ImageId>) {
-    let images: Vec<ImageId> = model.registered().collect();
+/// The model by its aligned places.
+fn problem_of(model: &Reconstruction) -> BundleProblem {
+    let mut sightings: Vec<(usize, ImageId, &Place)> = Vec::new();
+    for (at, point) in model.points.iter().enumerate() {
+        let Some(aligned) = &point.aligned else { continue };
+        sightings
+            .extend(point.track.iter().zip(&aligned.places).map(|(seen, place)| (at, seen.image, place)));
+        sightings.extend(aligned.further.iter().map(|(image, place)| (at, *image, place)));
+    }
+    let mut seen = vec![0_usize; model.images.len()];
+    for (_, image, _) in &sightings {
+        seen[image.index()] += 1;
+    }
+    let (poses, pose_of_image) = adjustable_poses(model, |image| seen[image.index()]);
+    let observation = |(point, image, place): (usize, ImageId, &Place)| {
+        let &Place { pixel, noise_px } = place;
+        Some(BundleObservation { pose: pose_of_image[image.index()]?, point: point as u32, pixel, noise_px })
+    };
+    let free = |point: &ReconstructionPoint| BundlePoint { position: point.position, fixed: false };
     let mut problem = BundleProblem {
         cameras: model.cameras.clone(),
         camera_freedom: vec![IntrinsicsFreedom::FIXED; model.cameras.len()],
+        poses,
+        points: model.points.iter().map(free).collect(),
+        observations: sightings.into_iter().filter_map(observation).collect(),
         ..BundleProblem::default()
     };
-    let pose_of = |image: ImageId| images.binary_search(&image).ok().map(|at| at as u32);
-    let mut seen_by = vec![0_usize; images.len()];
-    for (at, point) in model.points.iter().enumerate() {
-        problem.points.push(BundlePoint { position: point.position, fixed: false });
-        let Some(aligned) = &point.aligned else { continue };
-        let of_track = point.track.iter().map(|seen| seen.image).zip(&aligned.places);
-        let further = aligned.further.iter().map(|(image, place)| (*image, place));
-        for (image, place) in of_track.chain(further) {
-            let Some(pose) = pose_of(image) else { continue };
-            seen_by[pose as usize] += 1;
-            let (pixel, noise_px) = (place.pixel, place.noise_px);
-            problem.observations.push(BundleObservation { pose, point: at as u32, pixel, noise_px });
-        }
-    }
-    for (&image, &seen) in images.iter().zip(&seen_by) {
-        let image = &model.images[image.index()];
-        let fixed = problem.poses.is_empty() || seen < MIN_ADJUSTABLE_POINTS;
-        let world_from_camera = image.world_from_camera.unwrap_or_default();
-        problem.poses.push(BundlePose { camera: image.camera.0, world_from_camera, fixed });
-    }
     for length in &model.lengths {
-        length.hold_in(&mut problem, pose_of);
+        length.hold_in(&mut problem, |image| pose_of_image[image.index()]);
     }
-    (problem, images)
+    problem
 }
 
 /// The frame that brings the second poses nearest to the first: by their turns, then by their centres.
@@ -281,7 +279,7 @@ fn common_frame(pairs: &[(Rigid, Rigid)]) -> Similarity {
         .iter()
         .map(|(to, from)| (to.rotation * from.rotation.inverse()).to_rotation_matrix().into_inner())
         .sum();
-    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&turns));
+    let rotation = nearest_rotation(turns).unwrap_or_default();
     let count = pairs.len().max(1) as f64;
     let to = pairs.iter().map(|(to, _)| to.translation).sum::<Vector3<f64>>() / count;
     let from = pairs.iter().map(|(_, from)| from.translation).sum::<Vector3<f64>>() / count;
@@ -304,7 +302,9 @@ fn moved_alike(pose: &Rigid, before: &Rigid, after: &Rigid) -> Rigid {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{AlignedTrack, CameraId, Observation, Place, ReconstructionImage};
+    use nalgebra::UnitQuaternion;
+
+    use crate::{AlignedTrack, CameraId, Observation, ReconstructionImage};
     use setloc_features::Camera;
 
     /// Panoramas along a street between façades, whose places have noise of their own and shared errors, adjusted.
@@ -360,7 +360,7 @@ mod tests {
                 model.points.push(point);
             }
         }
-        let (mut problem, _) = problem_of(&model);
+        let mut problem = problem_of(&model);
         bundle::solve(&BundleParams::default(), &mut problem);
         for (image, pose) in model.images.iter_mut().zip(&problem.poses) {
             image.world_from_camera = Some(pose.world_from_camera);

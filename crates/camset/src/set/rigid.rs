@@ -38,11 +38,24 @@ impl RigidPose {
         sights: &Sights,
         bound: f64,
     ) {
-        self.agreeing = rays.agreeing(&world_from_set, bound, count);
-        self.sights = sights.agreeing(&world_from_set, bound);
-        self.lone = sights.agreeing_lone(&world_from_set, bound);
+        [self.agreeing, self.sights, self.lone] =
+            agreeing_with(&world_from_set, (rays, count), sights, bound);
         self.world_from_set = world_from_set;
     }
+}
+
+/// Correspondences, sights and lone sights that agree with a pose.
+fn agreeing_with(
+    world_from_set: &Similarity,
+    (rays, count): (&SetRays, usize),
+    sights: &Sights,
+    bound: f64,
+) -> [Vec<usize>; 3] {
+    [
+        rays.agreeing(world_from_set, bound, count),
+        sights.agreeing(world_from_set, bound),
+        sights.agreeing_lone(world_from_set, bound),
+    ]
 }
 
 /// The photos of a local model: poses in the set's frame, indices among all photos, and what all photos know alone.
@@ -99,16 +112,14 @@ pub(crate) fn rigid_pose(
     }
     let refined = refine_similarity(&initial, &rays.rays, params.max_error_sigmas);
     let world_from_set = if score(&refined) >= initial_score { refined } else { initial };
-    let agreeing = rays.agreeing(&world_from_set, params.max_error_sigmas, count);
+    let [agreeing, agreeing_sights, lone] = agreeing_with(&world_from_set, (rays, count), sights, bound);
     let mut keep = vec![true; count];
     let mut inlier = vec![false; count];
     for &correspondence in &agreeing {
         keep[correspondence] = false;
         inlier[correspondence] = true;
     }
-    let agreeing_sights = sights.agreeing(&world_from_set, bound);
     let by_rays = runner_up(params, &rays.subset(&keep), &world_from_set, set_from_camera, count, seed);
-    let lone = sights.agreeing_lone(&world_from_set, bound);
     let by_sights =
         rival_of_sights(params, sights, (&agreeing_sights, &lone), &world_from_set, set_from_camera, seed);
     let observability = observability(&world_from_set, &rays.subset(&inlier).rays);

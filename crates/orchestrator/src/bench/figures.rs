@@ -1,9 +1,9 @@
 use std::collections::BTreeMap;
 
-use nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Matrix6, Vector3};
 use serde::Serialize;
 use setloc_features::ImageFeatures;
-use setloc_sfm::{Observation, Reconstruction, ReconstructionPoint, Rigid, Similarity};
+use setloc_sfm::{Observation, Reconstruction, ReconstructionPoint, Rigid, Similarity, nearest_rotation};
 
 use super::NormalizedError;
 
@@ -162,14 +162,6 @@ fn by_poses(estimated: &BTreeMap<String, Rigid>, truth: &BTreeMap<String, Rigid>
     usable.then(|| Similarity { scale, rotation, translation: true_ - rotation * own * scale })
 }
 
-/// The rotation that has the greatest trace with a matrix.
-fn nearest_rotation(sum: Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
-    let svd = sum.iter().all(|value| value.is_finite()).then(|| sum.svd(true, true))?;
-    let (u, v_t) = (svd.u?, svd.v_t?);
-    let sign = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
-    Some(UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(u * sign * v_t)))
-}
-
 /// Rotation errors in degrees when the world's rotation is taken from the rotations themselves (chordal mean).
 ///
 /// Free of the error that a poorly spread set of centres gives the alignment.
@@ -237,6 +229,8 @@ pub fn mean_angular_error_px(
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::UnitQuaternion;
+
     use super::*;
 
     #[test]

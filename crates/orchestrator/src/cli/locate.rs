@@ -55,7 +55,8 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     remark(&photos);
     // Results of photos are kept beside the scene, where those of its images are.
     let session = args.run.session(&args.scene, Some(&args.output))?;
-    let pictures = Arc::new(PictureBook::read(&args.scene)?.at_hand());
+    let book = PictureBook::read(&args.scene)?;
+    let pictures = Arc::new(book.at_hand());
     let what = LocateJobs { scene: Arc::new(scene), pictures, config, seed: args.run.seed };
     let name = session.store.name_of("locate", &args.output);
     let mode = match args.mode {
@@ -80,7 +81,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     let found = verdict == Verdict::Localized;
     print::note(&format!("target {target}: {}", verdict.in_words()));
     let grown = match &args.grow {
-        Some(output) => write_grown((&args.scene, output), &session, &photos, &what, (&target, &located))?,
+        Some(output) => write_grown((output, &book), &session, &photos, &what, (&target, &located))?,
         None => true,
     };
     Ok((what.scene, located, if found && grown { Answer::Done } else { Answer::Negative }))
@@ -123,7 +124,7 @@ fn refuse_inputs(args: &LocateArgs, files: &[(String, PathBuf)]) -> Result<()> {
 
 /// Writes the scene that has grown, with its exports; false when there is nothing to grow by.
 fn write_grown(
-    (scene, output): (&Path, &Path),
+    (output, book): (&Path, &PictureBook),
     session: &Session,
     photos: &ImageFolder,
     what: &LocateJobs,
@@ -156,7 +157,7 @@ fn write_grown(
     let export = export_folder(output);
     write_atomically(output, &grown.file)?;
     write_models(&export, &grown.scene, &BTreeMap::new())?;
-    PictureBook::read(scene)?.write(output)?;
+    book.write(output)?;
     write_report(&export, (&grown.scene, grown.hash), &[], &[], session)?;
     let apart = located.answers().into_iter().map(|(_, photo)| photo);
     let apart = apart.filter(|photo| photo.verdict == Verdict::Localized && photo.component > 0);

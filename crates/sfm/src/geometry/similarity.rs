@@ -96,6 +96,15 @@ impl Similarity {
     }
 }
 
+/// The rotation that has the greatest trace with a matrix, the chordal mean of rotations where it is their sum; `None` where it
+/// is not finite.
+pub fn nearest_rotation(sum: Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
+    let svd = sum.iter().all(|value| value.is_finite()).then(|| sum.svd(true, true))?;
+    let (u, v_t) = (svd.u?, svd.v_t?);
+    let sign = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
+    Some(UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(u * sign * v_t)))
+}
+
 impl std::ops::Mul for Similarity {
     type Output = Self;
 
