@@ -84,6 +84,16 @@ impl Street {
 
     /// Panoramas every 5 m along the street, each turned its own way.
     fn of_panoramas(count: usize, noise_px: f64, module_points: usize, seed: u64) -> Self {
+        Self::of_panoramas_with(&Camera::equirectangular(3072, 1536), count, noise_px, module_points, seed)
+    }
+
+    fn of_panoramas_with(
+        camera: &Camera,
+        count: usize,
+        noise_px: f64,
+        module_points: usize,
+        seed: u64,
+    ) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed);
         let views = (0..count).map(|k| {
             let center =
@@ -93,7 +103,7 @@ impl Street {
                 rng.random_range(-3.1..3.1),
                 rng.random_range(-0.05..0.05),
             );
-            (Camera::equirectangular(3072, 1536), Rigid::new(turn, center))
+            (camera.clone(), Rigid::new(turn, center))
         });
         Self::new(views.collect(), noise_px, module_points, seed)
     }
@@ -214,6 +224,40 @@ fn a_street_of_panoramas_is_mapped_to_millimetres() {
     let (registered, worst_m, worst_deg) = street.errors(&output);
     assert_eq!((registered, output.components.len()), (10, 1));
     assert!(worst_m < 0.01 && worst_deg < 0.02, "{worst_m} m {worst_deg} deg");
+}
+
+#[test]
+fn stretched_panoramas_are_found_to_be_and_others_are_not() {
+    let plain = Camera::equirectangular(3072, 1536);
+    let mut stitched = plain.as_stitched().expect("is plain");
+    let truth = [-0.0035, 0.0004, 0.001, -0.0006];
+    stitched.params[4..].copy_from_slice(&truth);
+    let street = Street::of_panoramas_with(&stitched, 10, 0.3, 0, 11);
+    let cameras = vec![plain.clone(); 10];
+    let pairs = street.verified_pairs(&cameras);
+    let map = |calibrate_panoramas: bool| {
+        let params = MapperParams { calibrate_panoramas, ..MapperParams::default() };
+        street.map_pairs(&params, &cameras, Calibration::Known, &pairs)
+    };
+    let (found, without) = (map(true), map(false));
+    let camera = &found.components[0].cameras[0];
+    assert!(camera.is_stretched(), "{camera:?}");
+    for (value, expected) in camera.params[4..].iter().zip(&truth) {
+        assert!((value - expected).abs() < 2e-4, "{camera:?}");
+    }
+    let (registered, worst_m, worst_deg) = street.errors(&found);
+    assert_eq!(registered, 10);
+    assert!(worst_m < 0.015 && worst_deg < 0.03, "{worst_m} m {worst_deg} deg");
+    assert_eq!(without.components[0].cameras[0], plain);
+    let (_, worst_without_m, _) = street.errors(&without);
+    assert!(worst_without_m > 2.0 * worst_m, "{worst_without_m} m without, {worst_m} m with");
+
+    // Cameras that are told to be stretched stay as they are told, and panoramas that are not stay plain.
+    let told = street.map(&vec![stitched.clone(); 10], Calibration::Known);
+    assert_eq!(told.components[0].cameras, [stitched]);
+    let street = Street::of_panoramas(10, 0.3, 0, 12);
+    let output = street.map(&street.cameras, Calibration::Known);
+    assert_eq!(output.components[0].cameras, [plain]);
 }
 
 #[test]

@@ -5,6 +5,7 @@ mod lens;
 mod model;
 mod newton;
 mod paper_rectilinear;
+mod stitched;
 #[cfg(test)]
 mod tests;
 
@@ -23,6 +24,9 @@ const FISHEYE_FOCALS: [f64; 7] = [0.2, 0.24, 0.29, 0.35, 0.42, 0.5, 0.6];
 
 /// Focal length in half diagonals of the image below which [`Camera::is_wide`].
 const WIDE: f64 = 1.0;
+
+/// Largest parameter by which a panorama's directions may be stretched; stitching is off by a tenth of that at most.
+const MAX_STRETCH: f64 = 0.1;
 
 /// Places along a lens's curve that [`Camera::as_fisheye`] compares.
 const CURVE_SAMPLES: usize = 64;
@@ -203,6 +207,9 @@ impl Camera {
             if value <= 0.0 && matches!(role, ParamRole::Focal | ParamRole::SphereSize) {
                 return invalid(format!("{name} must be positive, got {value}"));
             }
+            if value.abs() > MAX_STRETCH && role == ParamRole::Stretch {
+                return invalid(format!("{name} must be within ±{MAX_STRETCH}, got {value}"));
+            }
         }
         Ok(())
     }
@@ -213,6 +220,7 @@ impl Camera {
     pub fn unproject(&self, pixel: &Vector2<f64>) -> Option<Vector3<f64>> {
         match self.lens() {
             Some((lens, k)) => lens.undistort(&k.normalize(pixel), &k.distortion),
+            None if self.is_stretched() => stitched::unproject(&self.params, pixel),
             None => equirectangular::unproject(&self.params, pixel),
         }
         .filter(|bearing| bearing.iter().all(|value| value.is_finite()))
@@ -224,6 +232,7 @@ impl Camera {
     pub fn project(&self, direction: &Vector3<f64>) -> Option<Vector2<f64>> {
         match self.lens() {
             Some((lens, k)) => lens.distort(direction, &k.distortion).map(|point| k.denormalize(&point)),
+            None if self.is_stretched() => stitched::project(&self.params, direction),
             None => equirectangular::project(&self.params, direction),
         }
         .filter(|pixel| pixel.iter().all(|value| value.is_finite()))
@@ -232,7 +241,12 @@ impl Camera {
     /// κ⁻¹ with its derivatives; `None` where [`Camera::project`] is, and exactly at a panorama's poles.
     pub fn project_with_jacobian(&self, direction: &Vector3<f64>) -> Option<ProjectJacobian> {
         let Some((lens, k)) = self.lens() else {
-            return equirectangular::project_with_jacobian(&self.params, direction);
+            let of_model = if self.is_stretched() {
+                stitched::project_with_jacobian
+            } else {
+                equirectangular::project_with_jacobian
+            };
+            return of_model(&self.params, direction);
         };
         let distorted = lens.distort_with_jacobian(direction, &k.distortion)?;
         let pixel = k.denormalize(&distorted.point);
@@ -253,7 +267,12 @@ impl Camera {
     /// κ with its derivatives; `None` where [`Camera::unproject`] is.
     pub fn unproject_with_jacobian(&self, pixel: &Vector2<f64>) -> Option<UnprojectJacobian> {
         let Some((lens, k)) = self.lens() else {
-            return equirectangular::unproject_with_jacobian(&self.params, pixel);
+            let of_model = if self.is_stretched() {
+                stitched::unproject_with_jacobian
+            } else {
+                equirectangular::unproject_with_jacobian
+            };
+            return of_model(&self.params, pixel);
         };
         let point = k.normalize(pixel);
         let undistorted = lens.undistort_with_jacobian(&point, &k.distortion)?;
@@ -315,7 +334,42 @@ impl Camera {
 
     /// Whether the camera sees the whole sphere (or is a crop of a picture that does).
     pub fn is_panoramic(&self) -> bool {
-        self.model == CameraModel::Equirectangular
+        matches!(self.model, CameraModel::Equirectangular | CameraModel::StitchedEquirectangular)
+    }
+
+    /// Whether this is a panorama whose stitching is known to stretch directions.
+    pub fn is_stretched(&self) -> bool {
+        self.model == CameraModel::StitchedEquirectangular
+    }
+
+    /// A plain panorama as one whose stretch can be estimated, none as yet; `None` of other cameras.
+    pub fn as_stitched(&self) -> Option<Self> {
+        let mut params = self.params.clone();
+        params.resize(MAX_CAMERA_PARAMS, 0.0);
+        let is_plain = self.model == CameraModel::Equirectangular;
+        is_plain.then_some(Self { model: CameraModel::StitchedEquirectangular, params, ..*self })
+    }
+
+    /// The plain panorama of a stretched one, other cameras as they are: what shows a direction here shows it there at
+    /// another pixel.
+    #[must_use]
+    pub fn without_stretch(&self) -> Self {
+        let mut plain = self.clone();
+        if let &[width, height, left, top, ..] = &*self.params
+            && self.is_stretched()
+        {
+            plain.model = CameraModel::Equirectangular;
+            plain.params =
+                if (left, top) == (0.0, 0.0) { vec![width, height] } else { vec![width, height, left, top] };
+        }
+        plain
+    }
+
+    /// The largest share by which directions are stretched against each other; 0 of cameras that stretch none.
+    pub fn largest_stretch(&self) -> f64 {
+        let of_stretch =
+            |(value, role): (&f64, &ParamRole)| (*role == ParamRole::Stretch).then_some(value.abs());
+        self.params.iter().zip(self.param_roles()).filter_map(of_stretch).fold(0.0, f64::max)
     }
 
     /// Whether the left and the right border of the image are neighbours on the sphere.
@@ -362,7 +416,7 @@ impl Camera {
             CameraModel::PaperRectilinear => {
                 (Lens::PaperRectilinear, Intrinsics::new(p[0], p[0], p[1], p[2], [0.0; 4]))
             }
-            CameraModel::Equirectangular => return None,
+            CameraModel::Equirectangular | CameraModel::StitchedEquirectangular => return None,
         })
     }
 }

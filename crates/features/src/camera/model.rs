@@ -26,6 +26,9 @@ pub enum CameraModel {
     Equirectangular,
     /// f, cx, cy of the paper's rectilinear formula, which is no pinhole off the axes; for reproduction only.
     PaperRectilinear,
+    /// A panorama whose stitching stretches directions: w, h of the full sphere, the crop's left and top (0 for a whole
+    /// one), and the stretch xx, xy, xz, yz. COLMAP has no such model.
+    StitchedEquirectangular,
 }
 
 /// What an intrinsic parameter stands for.
@@ -42,13 +45,15 @@ pub enum ParamRole {
     SphereSize,
     /// Left or top in pixels of a panorama's crop; never refined.
     CropOffset,
+    /// A term by which a panorama's directions are stretched.
+    Stretch,
 }
 
-use ParamRole::{CropOffset, Distortion, Focal, PrincipalPoint, SphereSize};
+use ParamRole::{CropOffset, Distortion, Focal, PrincipalPoint, SphereSize, Stretch};
 
 impl CameraModel {
     /// All models.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::SimplePinhole,
         Self::Pinhole,
         Self::SimpleRadial,
@@ -58,9 +63,10 @@ impl CameraModel {
         Self::OpencvFisheye,
         Self::Equirectangular,
         Self::PaperRectilinear,
+        Self::StitchedEquirectangular,
     ];
 
-    /// COLMAP's name.
+    /// COLMAP's name, or one of that kind where COLMAP has none.
     pub const fn name(self) -> &'static str {
         match self {
             Self::SimplePinhole => "SIMPLE_PINHOLE",
@@ -72,6 +78,7 @@ impl CameraModel {
             Self::OpencvFisheye => "OPENCV_FISHEYE",
             Self::Equirectangular => "EQUIRECTANGULAR",
             Self::PaperRectilinear => "PAPER_RECTILINEAR",
+            Self::StitchedEquirectangular => "STITCHED_EQUIRECTANGULAR",
         }
     }
 
@@ -80,7 +87,7 @@ impl CameraModel {
         Self::ALL.into_iter().find(|model| model.name() == name)
     }
 
-    /// COLMAP's numeric id, as binary files store it; `None` for the paper's formula, which COLMAP lacks.
+    /// COLMAP's numeric id, as binary files store it; `None` for the models that COLMAP lacks.
     pub const fn colmap_id(self) -> Option<i32> {
         match self {
             Self::SimplePinhole => Some(0),
@@ -91,7 +98,7 @@ impl CameraModel {
             Self::OpencvFisheye => Some(5),
             Self::SimpleFisheye => Some(14),
             Self::Equirectangular => Some(17),
-            Self::PaperRectilinear => None,
+            Self::PaperRectilinear | Self::StitchedEquirectangular => None,
         }
     }
 
@@ -118,6 +125,7 @@ impl CameraModel {
             Self::Opencv => &["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"],
             Self::OpencvFisheye => &["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"],
             Self::Equirectangular => &["w", "h", "left", "top"],
+            Self::StitchedEquirectangular => &["w", "h", "left", "top", "xx", "xy", "xz", "yz"],
         }
     }
 
@@ -141,6 +149,9 @@ impl CameraModel {
                 Distortion,
             ],
             Self::Equirectangular => &[SphereSize, SphereSize, CropOffset, CropOffset],
+            Self::StitchedEquirectangular => {
+                &[SphereSize, SphereSize, CropOffset, CropOffset, Stretch, Stretch, Stretch, Stretch]
+            }
         }
     }
 

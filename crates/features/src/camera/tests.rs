@@ -13,7 +13,7 @@ fn camera(model: CameraModel, width: u32, height: u32, params: &[f64]) -> Camera
 fn cameras() -> Vec<Camera> {
     use CameraModel::{
         Equirectangular, Opencv, OpencvFisheye, PaperRectilinear, Pinhole, Radial, SimpleFisheye,
-        SimplePinhole, SimpleRadial,
+        SimplePinhole, SimpleRadial, StitchedEquirectangular,
     };
     vec![
         camera(SimplePinhole, 1600, 1200, &[900.0, 790.0, 610.0]),
@@ -30,6 +30,13 @@ fn cameras() -> Vec<Camera> {
         Camera::equirectangular(3072, 1536),
         camera(Equirectangular, 1000, 700, &[3072.0, 1536.0, 2600.0, 500.0]),
         camera(PaperRectilinear, 1600, 1200, &[900.0, 800.0, 600.0]),
+        camera(
+            StitchedEquirectangular,
+            3072,
+            1536,
+            &[3072.0, 1536.0, 0.0, 0.0, -0.0032, 0.0008, 0.0011, -0.0006],
+        ),
+        camera(StitchedEquirectangular, 1000, 700, &[3072.0, 1536.0, 2600.0, 500.0, 0.05, -0.03, 0.02, 0.04]),
     ]
 }
 
@@ -135,7 +142,8 @@ fn tangential_distortion_is_added_to_what_lenses_of_this_kind_have() {
     for camera in cameras() {
         let opencv = camera.clone().with_tangential_distortion();
         if opencv == camera {
-            let kept = [CameraModel::Opencv, CameraModel::Equirectangular];
+            let kept =
+                [CameraModel::Opencv, CameraModel::Equirectangular, CameraModel::StitchedEquirectangular];
             let fisheye = camera.model.name().contains("FISHEYE");
             assert!(fisheye || kept.contains(&camera.model) || camera.model == CameraModel::PaperRectilinear);
             continue;
@@ -226,13 +234,41 @@ fn check_project(
 }
 
 fn param_step(camera: &Camera, index: usize) -> f64 {
-    if camera.param_roles()[index] == ParamRole::Distortion { 1e-6 } else { 1e-3 }
+    match camera.param_roles()[index] {
+        ParamRole::Distortion | ParamRole::Stretch => 1e-6,
+        _ => 1e-3,
+    }
 }
 
 fn moved(camera: &Camera, index: usize, step: f64) -> Camera {
     let mut moved = camera.clone();
     moved.params[index] += step;
     moved
+}
+
+#[test]
+fn a_stretch_spreads_what_lies_ahead_and_squeezes_what_lies_at_the_sides() {
+    let plain = Camera::equirectangular(4096, 2048);
+    let mut stitched = plain.as_stitched().unwrap();
+    assert_eq!((stitched.largest_stretch(), stitched.without_stretch()), (0.0, plain.clone()));
+    stitched.params[4] = 0.01;
+    assert_eq!((stitched.largest_stretch(), stitched.without_stretch()), (0.01, plain.clone()));
+    assert!(stitched.is_panoramic() && stitched.is_stretched() && stitched.wraps_around());
+    assert!(stitched.as_stitched().is_none());
+    // One pixel to either side of a place on the horizon, by the plain panorama and by this one.
+    let spread = |camera: &Camera, x: f64| {
+        let [left, right] = [x - 1.0, x + 1.0].map(|x| camera.unproject(&Vector2::new(x, 1024.0)).unwrap());
+        angle(&left, &right)
+    };
+    // Ahead (1 + xx)/(1 − xx), at the sides the inverse of that.
+    for (x, expected) in [(2048.0, 1.01 / 0.99), (3072.0, 0.99 / 1.01), (1024.0, 0.99 / 1.01)] {
+        let ratio = spread(&stitched, x) / spread(&plain, x);
+        assert!((ratio - expected).abs() < 1e-5, "{x}: {ratio}");
+    }
+    for off in [f64::NAN, 0.2] {
+        stitched.params[6] = off;
+        assert!(stitched.validate().is_err());
+    }
 }
 
 #[test]
@@ -309,7 +345,7 @@ fn directions_far_off_the_axis_survive_a_round_trip() {
 proptest! {
     #[test]
     fn any_direction_survives_a_round_trip(
-        index in 0usize..14, x in -1.0f64..1.0, y in -1.0f64..1.0, z in -1.0f64..1.0,
+        index in 0usize..16, x in -1.0f64..1.0, y in -1.0f64..1.0, z in -1.0f64..1.0,
     ) {
         let direction = Vector3::new(x, y, z);
         prop_assume!(direction.norm() > 1e-3);

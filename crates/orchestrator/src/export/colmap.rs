@@ -21,7 +21,7 @@ const BYTES_OF_KEYPOINT: usize = 26;
 /// What COLMAP's camera models cannot hold of a model's registered images; `None` when they hold all.
 pub fn colmap_lacks(model: &Reconstruction) -> Option<String> {
     model.registered().find_map(|id| {
-        let (camera, name) = (model.camera_of(id), &model.images[id.index()].name);
+        let (camera, name) = (model.camera_of(id).without_stretch(), &model.images[id.index()].name);
         let kind = camera.model.name();
         if camera.model.colmap_id().is_none() {
             return Some(format!("COLMAP has no camera model {kind}, which {name} has"));
@@ -37,6 +37,8 @@ pub fn colmap_lacks(model: &Reconstruction) -> Option<String> {
 /// Ids count from 1. COLMAP wants camera-from-world poses. `features[i]` belongs to image `i`; without it the line of
 /// 2D points stays empty, and tracks have no element in that image.
 ///
+/// COLMAP has no stretched panoramas: they are written as plain ones, and their keypoints where such a one shows them.
+///
 /// # Errors
 /// When COLMAP lacks a camera's model ([`colmap_lacks`]) or a file cannot be written.
 pub fn write_colmap(
@@ -50,7 +52,7 @@ pub fn write_colmap(
     let used: BTreeSet<CameraId> = model.registered().map(|id| model.images[id.index()].camera).collect();
     let mut cameras = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
     for id in used {
-        let camera = &model.cameras[id.index()];
+        let camera = model.cameras[id.index()].without_stretch();
         let (name, width, height) = (camera.model.name(), camera.width, camera.height);
         let params: Vec<String> = camera.params.iter().map(f64::to_string).collect();
         writeln!(cameras, "{} {name} {width} {height} {}", id.0 + 1, params.join(" "))?;
@@ -91,10 +93,16 @@ pub fn write_colmap(
         let (q, t) = (camera_from_world.rotation.quaternion(), camera_from_world.translation);
         let ids = format!("{} {}", image.camera.0 + 1, image.name);
         writeln!(lines, "{} {} {} {} {} {} {} {} {ids}", at + 1, q.w, q.i, q.j, q.k, t.x, t.y, t.z)?;
+        let camera = &model.cameras[image.camera.index()];
+        let plain = camera.is_stretched().then(|| camera.without_stretch());
+        let place = |keypoint: &Keypoint| {
+            let shown = plain.as_ref().and_then(|plain| plain.project(&camera.unproject(&keypoint.pixel())?));
+            shown.map_or([keypoint.x, keypoint.y], |pixel| [pixel.x as f32, pixel.y as f32])
+        };
         // Nearly all of the export: millions of numbers.
         let mut number = zmij::Buffer::new();
         for (keypoint, point) in keypoints[at].iter().zip(&seen[at]) {
-            for coordinate in [keypoint.x, keypoint.y] {
+            for coordinate in place(keypoint) {
                 lines.push_str(number.format(coordinate));
                 lines.push(' ');
             }
@@ -223,6 +231,26 @@ mod tests {
         assert_eq!(tracks, BTreeMap::from(expected));
         let (points, tracks) = written(&model, &[]);
         assert!(points.is_empty() && tracks.len() == 3 && tracks.values().all(Vec::is_empty), "{tracks:?}");
+    }
+
+    #[test]
+    fn stretched_panoramas_are_written_as_plain_ones_that_show_the_same_directions() {
+        let mut camera = Camera::equirectangular(200, 100).as_stitched().unwrap();
+        camera.params[4] = 0.01;
+        let keypoint = Keypoint { x: 130.0, y: 40.0, size: 3.0, orientation: 0.0, noise_px: 0.5 };
+        let features = ImageFeatures { keypoints: vec![keypoint], ..ImageFeatures::default() };
+        let folder = tempfile::tempdir().unwrap();
+        write_colmap(folder.path(), &scene(camera.clone(), &[]), &[Some(&features); 3]).unwrap();
+        let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
+        let cameras = read("cameras.txt");
+        assert_eq!(cameras.lines().nth(1), Some("1 EQUIRECTANGULAR 200 100 200 100"));
+        let images = read("images.txt");
+        let numbers: Vec<f64> =
+            images.lines().nth(3).unwrap().split(' ').map(|number| number.parse().unwrap()).collect();
+        let shown = Camera::equirectangular(200, 100).unproject(&[numbers[0], numbers[1]].into()).unwrap();
+        let expected = camera.unproject(&keypoint.pixel()).unwrap();
+        assert!(shown.angle(&expected) < 1e-6, "{shown} {expected}");
+        assert!((numbers[0] - 130.0).abs() > 0.2, "{numbers:?}");
     }
 
     #[test]

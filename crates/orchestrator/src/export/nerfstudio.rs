@@ -67,7 +67,8 @@ fn intrinsics(camera: &Camera) -> Option<(&'static str, Value)> {
         lens
     };
     let known = match camera.model {
-        CameraModel::Equirectangular => {
+        // Off by the stretch, which nerfstudio's model does not have.
+        CameraModel::Equirectangular | CameraModel::StitchedEquirectangular => {
             let (left, top) = p.get(2).zip(p.get(3)).unwrap_or((&0.0, &0.0));
             ("EQUIRECTANGULAR", lens(p[0] / 2.0, p[1], p[0] / 2.0 - left, p[1] / 2.0 - top))
         }

@@ -83,7 +83,11 @@ pub fn add_model(
     let params = json!({
         "sfm": mapper, "two_view": config.two_view, "quality": config.quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "calibrations": cameras.calibrations,
     });
-    let fixed = cameras.calibrations.iter().map(|calibration| calibration.is_settled()).collect();
+    // A plain panorama has nothing to adjust unless the mapper finds it stretched.
+    let is_fixed = |(calibration, camera): (&Calibration, &Camera)| {
+        calibration.is_settled() && camera.as_stitched().is_none()
+    };
+    let fixed = cameras.calibrations.iter().zip(&cameras.cameras).map(is_fixed).collect();
     let stage = ModelConfig {
         mapper,
         two_view: config.two_view.clone(),

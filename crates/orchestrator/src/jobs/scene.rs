@@ -188,6 +188,7 @@ pub fn add_scene(
             output.components.iter().map(SharedErrors::of_model).collect();
         let notes_of_errors: Vec<String> =
             shared_errors.iter().enumerate().filter_map(shared_errors_note).collect();
+        let stretches: Vec<String> = output.components.iter().enumerate().filter_map(stretch_note).collect();
         Product::new(SceneFile {
             components,
             indices: copy,
@@ -205,6 +206,7 @@ pub fn add_scene(
                 .chain(recall.as_ref().map(Recall::note))
                 .chain(fixes.as_deref().map(|fixes| positions::note(fixes, listed)))
                 .chain(relative)
+                .chain(stretches)
                 .chain(notes_of_errors)
                 .collect(),
             config: config.clone(),
@@ -234,11 +236,28 @@ pub fn add_scene(
     Ok(SceneJobs { features, model: jobs.model, scene })
 }
 
+/// Which component a note is of, unless it is the largest.
+fn of_component(component: usize) -> String {
+    if component == 0 { String::new() } else { format!(" in component {}", component + 1) }
+}
+
+/// Says by how much panoramas of a component are stretched, where that was told by it and not beforehand.
+fn stretch_note((component, model): (usize, &Reconstruction)) -> Option<String> {
+    let used = model.registered().map(|image| model.camera_of(image).largest_stretch());
+    let percent = 100.0 * used.fold(0.0, f64::max);
+    (percent > 0.0).then(|| {
+        format!(
+            "the panoramas{} stretch directions by up to {percent:.2} % (stitching, lenses), which is taken out \
+             (sfm.calibrate_panoramas)",
+            of_component(component)
+        )
+    })
+}
+
 /// Says what errors the images of a component share, where any are told.
 fn shared_errors_note((component, errors): (usize, &Option<SharedErrors>)) -> Option<String> {
     let degrees = errors.as_ref()?.sigma_rad().to_degrees();
-    let of_component =
-        if component == 0 { String::new() } else { format!(" in component {}", component + 1) };
+    let of_component = of_component(component);
     Some(format!(
         "neighbouring bearings of an image{of_component} are off together by {degrees:.3}° (stitching, lenses), which \
          covariances of photos have in them"

@@ -7,7 +7,7 @@ use crate::Rigid;
 
 /// Which intrinsic parameters of a camera are estimated.
 ///
-/// A role that the camera's model does not have (distortion of a pinhole, anything of a panorama) has no effect.
+/// A role that the camera's model does not have (distortion of a pinhole, anything of a plain panorama) has no effect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct IntrinsicsFreedom {
@@ -15,7 +15,7 @@ pub struct IntrinsicsFreedom {
     pub focal: bool,
     /// Principal point.
     pub principal_point: bool,
-    /// Distortion coefficients.
+    /// Distortion coefficients; a stitched panorama's stretch.
     pub distortion: bool,
 }
 
@@ -116,13 +116,13 @@ const ALIKE_FOCAL: f64 = 0.01;
 impl CameraPrior {
     /// What holds for the usual photo, as standard deviations: the principal point lies within 0.5 % of the longer side of
     /// the image's centre, the first radial coefficient is within 0.2, further ones within 0.05, tangential ones within
-    /// 0.001, and pixels are square to 0.1 %; nothing is known of the focal length. `None` for panoramas, which have
-    /// nothing to estimate.
+    /// 0.001, and pixels are square to 0.1 %; nothing is known of the focal length. Stitched panoramas are stretched by less
+    /// than 1 %. `None` for plain panoramas, which have nothing to estimate.
     ///
     /// Calibrations of phones, action and system cameras put the principal point 0.1–1 % off the centre. Photos that were
     /// cropped have it anywhere, so the loss lets go of what is many deviations off.
     pub fn of_usual_photo(index: u32, camera: &Camera) -> Option<Self> {
-        if camera.is_panoramic() {
+        if camera.is_panoramic() && !camera.is_stretched() {
             return None;
         }
         let (width, height) = (f64::from(camera.width), f64::from(camera.height));
@@ -133,12 +133,15 @@ impl CameraPrior {
                 (ParamRole::Distortion, "k" | "k1") => (0.0, 0.2),
                 (ParamRole::Distortion, "p1" | "p2") => (0.0, 0.001),
                 (ParamRole::Distortion, _) => (0.0, 0.05),
+                (ParamRole::Stretch, "xx") => (0.0, 0.004),
+                (ParamRole::Stretch, _) => (0.0, 0.001),
                 _ => (0.0, f64::INFINITY),
             };
             ParameterEstimate { value, sigma }
         };
         let parameters = camera.param_roles().iter().zip(camera.model.param_names()).map(known).collect();
-        Some(Self { camera: index, parameters, aspect_sigma: 0.001, loss: RobustLoss::Cauchy(UNUSUAL) })
+        let loss = if camera.is_stretched() { RobustLoss::Trivial } else { RobustLoss::Cauchy(UNUSUAL) };
+        Some(Self { camera: index, parameters, aspect_sigma: 0.001, loss })
     }
 
     /// What holds for the usual photo, and that the focal length is within 1 % of this camera's.

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector2, Vector3};
 use rayon::prelude::*;
-use setloc_features::{Camera, CameraModel, MAX_CAMERA_PARAMS};
+use setloc_features::{Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole};
 
 use super::normal_equations::{BlockTerm, ExtraTerm, Linearized, Link, Model, Structure};
 use super::pattern::NONE;
@@ -562,7 +562,7 @@ fn bearing_and_weight(camera: &Camera, pixel: &Vector2<f64>, noise_px: f64) -> O
 /// Focal lengths within the parameters.
 fn focal_parameters(model: CameraModel) -> std::ops::Range<usize> {
     match model {
-        CameraModel::Equirectangular => 0..0,
+        CameraModel::Equirectangular | CameraModel::StitchedEquirectangular => 0..0,
         CameraModel::Pinhole | CameraModel::Opencv | CameraModel::OpencvFisheye => 0..2,
         _ => 0..1,
     }
@@ -570,8 +570,10 @@ fn focal_parameters(model: CameraModel) -> std::ops::Range<usize> {
 
 /// Indices of the parameters that are estimated, ascending.
 fn free_parameters(camera: &Camera, freedom: IntrinsicsFreedom) -> Vec<usize> {
-    if camera.model == CameraModel::Equirectangular {
-        return Vec::new();
+    if camera.is_panoramic() {
+        let roles = camera.param_roles().iter().enumerate();
+        let of_stretch = roles.filter(|(_, role)| **role == ParamRole::Stretch && freedom.distortion);
+        return of_stretch.map(|(index, _)| index).collect();
     }
     let focal = focal_parameters(camera.model);
     let principal = focal.end..focal.end + 2;

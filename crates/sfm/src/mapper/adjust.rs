@@ -86,7 +86,7 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
     }
     if scope.intrinsics {
         for camera in 0..model.cameras.len() {
-            if !model.input.is_fixed(camera) && tells_camera(model, &model.registered_with(camera)) {
+            if model.is_open(camera) && tells_camera(model, &model.registered_with(camera)) {
                 problem.camera_freedom[camera] = IntrinsicsFreedom::FREE;
                 let usual = CameraPrior::of_usual_photo(camera as u32, &model.cameras[camera]);
                 problem.camera_priors.extend(usual);

@@ -343,6 +343,11 @@ impl<'a> Model<'a> {
         self.point_of_feature[image.index()].iter().filter(|&&id| id != NO_POINT).count()
     }
 
+    /// Whether the intrinsics of a camera are estimated: they are not told, or its panoramas were found to be stretched.
+    pub fn is_open(&self, camera: usize) -> bool {
+        !self.input.is_fixed(camera) || self.cameras[camera].model != self.input.cameras[camera].model
+    }
+
     /// Recomputes the rays of every image that uses `camera` after its intrinsics have changed.
     pub fn refresh_rays(&mut self, camera: usize) {
         let camera_now = &self.cameras[camera];

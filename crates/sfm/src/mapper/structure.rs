@@ -11,6 +11,13 @@ pub(super) struct PointLimits {
     pub min_angle_rad: f64,
 }
 
+impl PointLimits {
+    /// The same for observations that are `factor` times farther off.
+    pub fn widened(self, factor: f64) -> Self {
+        Self { max_error_sigma: self.max_error_sigma * factor, ..self }
+    }
+}
+
 /// Points that are worth handing to another thread.
 pub(super) const POINTS_PER_TASK: usize = 256;
 
