@@ -92,7 +92,8 @@ struct Draw<'a> {
 
 impl<'a> Draw<'a> {
     fn new(scene: &'a Scene<'a>, errors: &'a SharedErrors, number: u32, images: &BTreeSet<ImageId>) -> Self {
-        let fields = images.iter().map(|&image| (image, errors.field(image, number))).collect();
+        let field = |&image: &ImageId| (image, errors.field(scene.reconstruction, image, number));
+        let fields = images.iter().map(field).collect();
         Self { scene, errors, number, fields }
     }
 
@@ -171,7 +172,7 @@ mod tests {
                 .map(|seen| {
                     let pose = scene.reconstruction.images[seen.image.index()].world_from_camera.unwrap();
                     let bearing = pose.inverse().transform_point(&point.position).normalize();
-                    let off = errors.field(seen.image, 0).at(&bearing);
+                    let off = errors.field(scene.reconstruction, seen.image, 0).at(&bearing);
                     WorldRay::new(&pose, &(bearing + off).normalize(), 1e-3)
                 })
                 .collect();

@@ -32,7 +32,7 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// 10: says which images it has grown by. 11: an index for each component, features of all their images, and which of
 /// them are placed. 12: about which images it may be folded. 13: which
 /// errors its images share.
-pub const SCENE_VERSION: u32 = 13;
+pub const SCENE_VERSION: u32 = 14;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
 /// Version of set localization.

@@ -11,10 +11,12 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use setloc_features::Camera;
 
 use crate::alignment::{adjustable_poses, shares_standpoints};
 use crate::bundle::{
-    self, BundleObservation, BundleParams, BundlePoint, BundleProblem, IntrinsicsFreedom, RobustLoss,
+    self, BundleObservation, BundleParams, BundlePoint, BundleProblem, CameraPrior, IntrinsicsFreedom,
+    RobustLoss,
 };
 use crate::synthetic::normal;
 use crate::{ImageId, Place, Reconstruction, ReconstructionPoint, Rigid, Similarity, nearest_rotation};
@@ -47,13 +49,16 @@ pub struct SharedErrors {
     sigma_rad: f64,
     /// Poses by draw, then by image.
     poses: Vec<Vec<Option<Rigid>>>,
+    /// The model's cameras by draw; none where no draw changes any.
+    cameras: Vec<Vec<Camera>>,
 }
 
 impl SharedErrors {
     /// The errors of a model that has aligned places ([`crate::AlignedTrack`]); `None` where residuals show none that matter, or
     /// are too few to tell.
     ///
-    /// Intrinsics stay as they are. What whole hemispheres share is not in it, as the poses take it up.
+    /// Intrinsics stay as they are, but for how panoramas are stretched: that was told by the same bearings. What whole
+    /// hemispheres share besides is not in it, as the poses take it up.
     pub fn of_model(model: &Reconstruction) -> Option<Self> {
         let images: Vec<ImageId> = model.registered().collect();
         if shares_standpoints(model, &images) {
@@ -81,22 +86,28 @@ impl SharedErrors {
             let pairs: Vec<(Rigid, Rigid)> =
                 pairs.map(|(to, from)| (to.world_from_camera, from.world_from_camera)).collect();
             let frame = common_frame(&pairs);
+            let cameras = model.cameras.iter().zip(problem.cameras.iter().zip(&moved.cameras));
+            let cameras: Vec<Camera> = cameras.map(|(own, change)| changed_alike(own, change)).collect();
             let mut poses = vec![None; model.images.len()];
             for (&image, (before, after)) in images.iter().zip(&pairs) {
                 // The draw is told by what it moves; where the model itself is may be a little off its aligned places.
                 let stated = model.images[image.index()].world_from_camera.unwrap_or(*before);
                 poses[image.index()] = Some(moved_alike(&stated, before, &frame.transform_pose(after)));
             }
-            poses
+            (poses, cameras)
         };
         let draws: Vec<u32> = (0..DRAWS).collect();
-        let poses = draws.par_iter().with_max_len(1).map(|&draw| of_draw(draw)).collect();
-        Some(Self { sigma_rad, poses })
+        let (poses, mut cameras): (Vec<_>, Vec<_>) =
+            draws.par_iter().with_max_len(1).map(|&draw| of_draw(draw)).unzip();
+        if !model.cameras.iter().any(Camera::is_stretched) {
+            cameras.clear();
+        }
+        Some(Self { sigma_rad, poses, cameras })
     }
 
     /// Errors of this standard deviation about given poses, by draw and image.
     pub fn new(sigma_rad: f64, poses: Vec<Vec<Option<Rigid>>>) -> Self {
-        Self { sigma_rad, poses }
+        Self { sigma_rad, poses, cameras: Vec::new() }
     }
 
     /// Standard deviation of a bearing, per tangent axis, in radians.
@@ -114,16 +125,26 @@ impl SharedErrors {
         *self.poses.get(draw as usize)?.get(image.index())?
     }
 
-    /// The errors of an image's bearings in a draw.
-    pub fn field(&self, image: ImageId, draw: u32) -> BearingField {
-        BearingField::new(self.sigma_rad, image, draw)
+    /// The errors of the bearings of an image of `model` in a draw.
+    pub fn field(&self, model: &Reconstruction, image: ImageId, draw: u32) -> BearingField {
+        let camera = model.images.get(image.index()).map(|image| image.camera.index());
+        let changed = camera.and_then(|camera| {
+            let drawn = self.cameras.get(draw as usize)?.get(camera)?;
+            let own = model.cameras.get(camera)?;
+            (drawn != own).then(|| [own.clone(), drawn.clone()])
+        });
+        BearingField { changed, ..BearingField::new(self.sigma_rad, image, draw) }
     }
 }
 
 /// A smooth random field of bearing errors over the sphere, by random Fourier features (A. Rahimi, B. Recht, "Random
-/// features for large-scale kernel machines", NIPS 2007).
+/// features for large-scale kernel machines", NIPS 2007), and what a change of the camera adds to it.
 #[derive(Debug, Clone)]
-pub struct BearingField(Vec<Wave>);
+pub struct BearingField {
+    waves: Vec<Wave>,
+    /// The camera and what it is in the draw.
+    changed: Option<[Camera; 2]>,
+}
 
 #[derive(Debug, Clone)]
 struct Wave {
@@ -141,18 +162,23 @@ impl BearingField {
             let amplitude = Vector3::from_fn(|_, _| normal(&mut rng)) * scale;
             Wave { vector, phase: rng.random_range(0.0..std::f64::consts::TAU), amplitude }
         };
-        Self((0..WAVES).map(wave).collect())
+        Self { waves: (0..WAVES).map(wave).collect(), changed: None }
     }
 
     /// The error of a bearing of unit length in the camera frame, across it.
     pub fn at(&self, bearing: &Vector3<f64>) -> Vector3<f64> {
-        let sum: Vector3<f64> =
-            self.0.iter().map(|wave| wave.amplitude * (wave.vector.dot(bearing) + wave.phase).cos()).sum();
+        let of_wave = |wave: &Wave| wave.amplitude * (wave.vector.dot(bearing) + wave.phase).cos();
+        let mut sum: Vector3<f64> = self.waves.iter().map(of_wave).sum();
+        if let Some([own, drawn]) = &self.changed
+            && let Some(seen) = own.project(bearing).and_then(|pixel| drawn.unproject(&pixel))
+        {
+            sum += seen - bearing;
+        }
         sum - bearing * bearing.dot(&sum)
     }
 
     /// Where a pixel is moved to.
-    pub fn moved(&self, camera: &setloc_features::Camera, pixel: &Vector2<f64>) -> Option<Vector2<f64>> {
+    pub fn moved(&self, camera: &Camera, pixel: &Vector2<f64>) -> Option<Vector2<f64>> {
         let bearing = camera.unproject(pixel)?;
         camera.project(&(bearing + self.at(&bearing)))
     }
@@ -257,9 +283,16 @@ fn problem_of(model: &Reconstruction) -> BundleProblem {
         Some(BundleObservation { pose: pose_of_image[image.index()]?, point: point as u32, pixel, noise_px })
     };
     let free = |point: &ReconstructionPoint| BundlePoint { position: point.position, fixed: false };
+    let freedom = |camera: &Camera| {
+        if camera.is_stretched() { IntrinsicsFreedom::FREE } else { IntrinsicsFreedom::FIXED }
+    };
+    let stretched = model.cameras.iter().enumerate().filter(|(_, camera)| camera.is_stretched());
     let mut problem = BundleProblem {
         cameras: model.cameras.clone(),
-        camera_freedom: vec![IntrinsicsFreedom::FIXED; model.cameras.len()],
+        camera_freedom: model.cameras.iter().map(freedom).collect(),
+        camera_priors: stretched
+            .filter_map(|(at, camera)| CameraPrior::of_usual_photo(at as u32, camera))
+            .collect(),
         poses,
         points: model.points.iter().map(free).collect(),
         observations: sightings.into_iter().filter_map(observation).collect(),
@@ -299,18 +332,29 @@ fn moved_alike(pose: &Rigid, before: &Rigid, after: &Rigid) -> Rigid {
     Rigid::new(turn * pose.rotation, pose.translation + after.translation - before.translation)
 }
 
+/// A camera with its parameters changed as those of another one are from before to after.
+fn changed_alike(camera: &Camera, (before, after): (&Camera, &Camera)) -> Camera {
+    let mut changed = camera.clone();
+    for (value, (before, after)) in changed.params.iter_mut().zip(before.params.iter().zip(&after.params)) {
+        *value += after - before;
+    }
+    changed
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use nalgebra::UnitQuaternion;
 
     use crate::{AlignedTrack, CameraId, Observation, ReconstructionImage};
-    use setloc_features::Camera;
 
     /// Panoramas along a street between façades, whose places have noise of their own and shared errors, adjusted.
     fn street(noise_px: f64, shared_rad: f64, seed: u64) -> (Reconstruction, Vec<Rigid>) {
+        street_of(&Camera::equirectangular(4096, 2048), noise_px, shared_rad, seed)
+    }
+
+    fn street_of(camera: &Camera, noise_px: f64, shared_rad: f64, seed: u64) -> (Reconstruction, Vec<Rigid>) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let camera = Camera::equirectangular(4096, 2048);
         let truth: Vec<Rigid> = (0..6)
             .map(|at| {
                 let turn = UnitQuaternion::from_euler_angles(0.0, 0.4 * f64::from(at), 0.0);
@@ -368,6 +412,7 @@ mod tests {
         for (point, refined) in model.points.iter_mut().zip(&problem.points) {
             point.position = refined.position;
         }
+        model.cameras = problem.cameras;
         (model, truth)
     }
 
@@ -410,6 +455,33 @@ mod tests {
         for (squared, expected) in squared.iter().zip(&expected) {
             assert!((0.4..2.5).contains(&(squared / expected)), "{}", squared / expected);
         }
+    }
+
+    #[test]
+    fn how_far_a_stretch_may_be_off_is_told() {
+        let mut camera = Camera::equirectangular(4096, 2048).as_stitched().unwrap();
+        camera.params[4] = -0.003;
+        let terms = |camera: &Camera| camera.params[4..].to_vec();
+        let apart = |a: &Camera, b: &Camera| -> f64 {
+            terms(a).iter().zip(terms(b)).map(|(a, b)| (a - b).powi(2)).sum()
+        };
+        let (mut squared, mut expected) = (0.0, 0.0);
+        for seed in 0..6 {
+            let (model, _) = street_of(&camera, 0.2, 4e-4, seed);
+            let errors = SharedErrors::of_model(&model).expect("are shown");
+            squared += apart(&model.cameras[0], &camera);
+            for draw in 0..errors.draws() {
+                let drawn = &errors.cameras[draw as usize][0];
+                expected += apart(drawn, &model.cameras[0]) / f64::from(errors.draws());
+                // Seen by the drawn camera, a bearing is where the field says.
+                let bearing = Vector3::new(0.6, -0.2, 0.7).normalize();
+                let waves = BearingField::new(errors.sigma_rad(), ImageId(1), draw).at(&bearing);
+                let seen = drawn.unproject(&model.cameras[0].project(&bearing).unwrap()).unwrap();
+                let change = errors.field(&model, ImageId(1), draw).at(&bearing) - waves;
+                assert!((change - (seen - bearing)).norm() < 1e-6, "{change}");
+            }
+        }
+        assert!((0.3..3.0).contains(&(squared / expected)), "{squared} {expected}");
     }
 
     #[test]
