@@ -241,7 +241,7 @@ fn of_component(component: usize) -> String {
     if component == 0 { String::new() } else { format!(" in component {}", component + 1) }
 }
 
-/// Says by how much panoramas of a component are stretched, where that was told by it and not beforehand.
+/// Says by how much panoramas of a component are stretched, if any are.
 fn stretch_note((component, model): (usize, &Reconstruction)) -> Option<String> {
     let used = model.registered().map(|image| model.camera_of(image).largest_stretch());
     let percent = 100.0 * used.fold(0.0, f64::max);
