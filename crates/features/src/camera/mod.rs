@@ -220,8 +220,7 @@ impl Camera {
     pub fn unproject(&self, pixel: &Vector2<f64>) -> Option<Vector3<f64>> {
         match self.lens() {
             Some((lens, k)) => lens.undistort(&k.normalize(pixel), &k.distortion),
-            None if self.is_stretched() => stitched::unproject(&self.params, pixel),
-            None => equirectangular::unproject(&self.params, pixel),
+            None => (self.sphere().unproject)(&self.params, pixel),
         }
         .filter(|bearing| bearing.iter().all(|value| value.is_finite()))
     }
@@ -232,8 +231,7 @@ impl Camera {
     pub fn project(&self, direction: &Vector3<f64>) -> Option<Vector2<f64>> {
         match self.lens() {
             Some((lens, k)) => lens.distort(direction, &k.distortion).map(|point| k.denormalize(&point)),
-            None if self.is_stretched() => stitched::project(&self.params, direction),
-            None => equirectangular::project(&self.params, direction),
+            None => (self.sphere().project)(&self.params, direction),
         }
         .filter(|pixel| pixel.iter().all(|value| value.is_finite()))
     }
@@ -241,12 +239,7 @@ impl Camera {
     /// κ⁻¹ with its derivatives; `None` where [`Camera::project`] is, and exactly at a panorama's poles.
     pub fn project_with_jacobian(&self, direction: &Vector3<f64>) -> Option<ProjectJacobian> {
         let Some((lens, k)) = self.lens() else {
-            let of_model = if self.is_stretched() {
-                stitched::project_with_jacobian
-            } else {
-                equirectangular::project_with_jacobian
-            };
-            return of_model(&self.params, direction);
+            return (self.sphere().project_with_jacobian)(&self.params, direction);
         };
         let distorted = lens.distort_with_jacobian(direction, &k.distortion)?;
         let pixel = k.denormalize(&distorted.point);
@@ -267,12 +260,7 @@ impl Camera {
     /// κ with its derivatives; `None` where [`Camera::unproject`] is.
     pub fn unproject_with_jacobian(&self, pixel: &Vector2<f64>) -> Option<UnprojectJacobian> {
         let Some((lens, k)) = self.lens() else {
-            let of_model = if self.is_stretched() {
-                stitched::unproject_with_jacobian
-            } else {
-                equirectangular::unproject_with_jacobian
-            };
-            return of_model(&self.params, pixel);
+            return (self.sphere().unproject_with_jacobian)(&self.params, pixel);
         };
         let point = k.normalize(pixel);
         let undistorted = lens.undistort_with_jacobian(&point, &k.distortion)?;
@@ -395,6 +383,11 @@ impl Camera {
         &self.model.param_roles()[..self.params.len()]
     }
 
+    /// What a panorama, stretched or not, is computed by.
+    fn sphere(&self) -> &'static Sphere {
+        if self.is_stretched() { &STITCHED } else { &PLAIN }
+    }
+
     fn lens(&self) -> Option<(Lens, Intrinsics)> {
         let p = self.params.as_slice();
         Some(match self.model {
@@ -420,3 +413,25 @@ impl Camera {
         })
     }
 }
+
+/// κ and its inverse on the whole sphere, by a panorama's parameters.
+struct Sphere {
+    unproject: fn(&[f64], &Vector2<f64>) -> Option<Vector3<f64>>,
+    project: fn(&[f64], &Vector3<f64>) -> Option<Vector2<f64>>,
+    unproject_with_jacobian: fn(&[f64], &Vector2<f64>) -> Option<UnprojectJacobian>,
+    project_with_jacobian: fn(&[f64], &Vector3<f64>) -> Option<ProjectJacobian>,
+}
+
+const PLAIN: Sphere = Sphere {
+    unproject: equirectangular::unproject,
+    project: equirectangular::project,
+    unproject_with_jacobian: equirectangular::unproject_with_jacobian,
+    project_with_jacobian: equirectangular::project_with_jacobian,
+};
+
+const STITCHED: Sphere = Sphere {
+    unproject: stitched::unproject,
+    project: stitched::project,
+    unproject_with_jacobian: stitched::unproject_with_jacobian,
+    project_with_jacobian: stitched::project_with_jacobian,
+};

@@ -1,4 +1,5 @@
 use rayon::prelude::*;
+use setloc_features::Camera;
 
 use super::model::{Model, ModelPoint};
 use crate::{
@@ -142,6 +143,41 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
         }
     }
     report
+}
+
+/// What a global adjustment says of a camera that the model could have in place of its own.
+pub(super) struct CameraTrial {
+    /// With the model's own camera.
+    pub own: BundleReport,
+    /// With the other one.
+    pub other: BundleReport,
+}
+
+impl CameraTrial {
+    /// Whether the other camera ignores no more observations and leaves less than this share of the cost.
+    pub fn spares(&self, max_share: f64) -> bool {
+        self.other.ignored <= self.own.ignored && self.other.final_cost < max_share * self.own.final_cost
+    }
+}
+
+/// Adjusts the model with its own camera and with another one in its place, which stays where it `pays`; whether it does.
+pub(super) fn try_camera(
+    model: &mut Model<'_>,
+    (camera, other): (usize, Camera),
+    params: &BundleParams,
+    pays: impl Fn(&CameraTrial) -> bool,
+) -> bool {
+    let scope = Scope::global(model);
+    let mut trial = model.clone();
+    trial.cameras[camera] = other;
+    trial.refresh_rays(camera);
+    let reports =
+        CameraTrial { other: adjust(&mut trial, params, &scope), own: adjust(model, params, &scope) };
+    let is_taken = pays(&reports);
+    if is_taken {
+        *model = trial;
+    }
+    is_taken
 }
 
 #[cfg(test)]

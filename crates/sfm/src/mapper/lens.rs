@@ -5,7 +5,7 @@
 
 use super::{
     MapperParams,
-    adjust::{Scope, adjust, tells_camera},
+    adjust::{tells_camera, try_camera},
     model::Model,
 };
 
@@ -24,20 +24,9 @@ pub(super) fn choose_lenses(model: &mut Model<'_>, params: &MapperParams) -> boo
             continue;
         }
         let Some(fisheye) = lens.as_fisheye() else { continue };
-        let bundle = params.bundle(20);
-        let scope = Scope::global(model);
-        let mut trial = model.clone();
-        trial.cameras[camera] = fisheye;
-        trial.refresh_rays(camera);
-        let other = adjust(&mut trial, &bundle, &scope);
-        let usual = adjust(model, &bundle, &scope);
-        let is_better = usual.observations >= MIN_OBSERVATIONS
-            && other.ignored <= usual.ignored
-            && other.final_cost < MAX_COST * usual.final_cost;
-        if is_better {
-            *model = trial;
-            changed = true;
-        }
+        changed |= try_camera(model, (camera, fisheye), &params.bundle(20), |trial| {
+            trial.own.observations >= MIN_OBSERVATIONS && trial.spares(MAX_COST)
+        });
     }
     changed
 }

@@ -5,11 +5,7 @@
 //! street that turns is bent. No residual of a straight drive shows that, as its points give way; where headings
 //! differ, all residuals together do.
 
-use super::{
-    MapperParams,
-    adjust::{Scope, adjust},
-    model::Model,
-};
+use super::{MapperParams, adjust::try_camera, model::Model};
 
 /// The share of the cost that a stretch has to spare. In right models of panoramas that are not stretched it spares
 /// 0.00–0.11 %, in models of stretched ones 3–17 %.
@@ -29,20 +25,9 @@ pub(super) fn measure_stitching(model: &mut Model<'_>, params: &MapperParams) ->
         if model.registered_with(camera).len() < MIN_IMAGES {
             continue;
         }
-        let bundle = params.bundle(MAX_ITERATIONS);
-        let scope = Scope::global(model);
-        let mut trial = model.clone();
-        trial.cameras[camera] = stitched;
-        let stretched = adjust(&mut trial, &bundle, &scope);
-        let plain = adjust(model, &bundle, &scope);
-        let gain = plain.final_cost - stretched.final_cost;
-        let is_better = stretched.ignored <= plain.ignored
-            && gain > MIN_GAIN
-            && stretched.final_cost < MAX_COST * plain.final_cost;
-        if is_better {
-            *model = trial;
-            changed = true;
-        }
+        changed |= try_camera(model, (camera, stitched), &params.bundle(MAX_ITERATIONS), |trial| {
+            trial.own.final_cost - trial.other.final_cost > MIN_GAIN && trial.spares(MAX_COST)
+        });
     }
     changed
 }
