@@ -51,6 +51,8 @@ pub(crate) enum KnownOfCamera {
     Usual,
     /// That it differs from this one by little.
     Alike(Camera),
+    /// Its intrinsics but for the focal lengths, which are near this one's.
+    AllButFocal(Camera),
 }
 
 impl JointCamera {
@@ -62,6 +64,7 @@ impl JointCamera {
         match self.known {
             KnownOfCamera::Intrinsics => IntrinsicsFreedom::FIXED,
             KnownOfCamera::Usual | KnownOfCamera::Alike(_) => IntrinsicsFreedom::FREE,
+            KnownOfCamera::AllButFocal(_) => IntrinsicsFreedom { focal: true, ..IntrinsicsFreedom::FIXED },
         }
     }
 
@@ -69,6 +72,7 @@ impl JointCamera {
     fn prior(&self, index: u32) -> Option<CameraPrior> {
         match &self.known {
             KnownOfCamera::Alike(alike) => CameraPrior::alike(index, alike),
+            KnownOfCamera::AllButFocal(near) => Some(CameraPrior::told(index, near)),
             KnownOfCamera::Intrinsics | KnownOfCamera::Usual => {
                 CameraPrior::of_usual_photo(index, &self.camera)
             }

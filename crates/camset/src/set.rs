@@ -392,6 +392,7 @@ mod tests {
     use std::convert::Infallible;
 
     use nalgebra::{UnitQuaternion, Vector3};
+    use setloc_features::Camera;
 
     use super::*;
     use crate::jackknife::deviation;
@@ -457,6 +458,31 @@ mod tests {
         assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
         let target = &found.paths[8];
         assert!(target.links.len() > 2 && target.weakest().is_some_and(|link| link.shared >= 12));
+    }
+
+    #[test]
+    fn a_told_focal_length_that_the_local_model_contradicts_is_estimated_and_named() {
+        let world = World::chain(9, 0.2, 1);
+        let mut told = world.camera.clone();
+        told.params[0] *= 1.01;
+        told.params[1] *= 1.01;
+        let located = |camera: &Camera| {
+            let queries = world.queries().into_iter().map(|photo| QueryPhoto { camera, ..photo });
+            let queries: Vec<QueryPhoto<'_>> = queries.collect();
+            let models = std::slice::from_ref(&world.local);
+            locate_photos(&CamsetParams::default(), &world.scene(), &queries, models, 7)
+        };
+        let is_named = |found: &SetLocalization| found.advice.iter().any(|text| text.contains("is told for"));
+        let found = located(&told);
+        assert!(found.refined.iter().all(|photo| photo.verdict == Verdict::Localized));
+        let (center, rotation) = worst_errors(&world, &found.refined);
+        assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
+        let share = found.refined[0].camera.focal_length() / world.camera.focal_length() - 1.0;
+        assert!(share.abs() < 2e-3, "{share}");
+        assert_eq!(found.refined[0].camera.params[2..], world.camera.params[2..]);
+        assert!(is_named(&found), "{:?}", found.advice);
+        let found = located(&world.camera);
+        assert!(!is_named(&found) && found.refined[0].camera == world.camera);
     }
 
     /// Locates the photos of a world as a set, with what was found of them alone changed.

@@ -23,6 +23,7 @@ mod stitching;
 mod structure;
 #[cfg(test)]
 mod test_street;
+mod told;
 pub(crate) mod wall;
 mod witnesses;
 
@@ -58,7 +59,8 @@ use self::{
     standpoint::Standpoints,
     stitching::measure_stitching,
     structure::{PointLimits, complete_and_merge, filter, triangulate_image, triangulate_match},
-    witnesses::{Testimony, Witnesses},
+    told::correct_told,
+    witnesses::{Testimony, Witnesses, count_on_circles},
 };
 use crate::{
     BaselineLength, CameraId, Georegistration, ImageId, Observation, OutvotedPair, PairGeometry, PointId,
@@ -68,7 +70,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 36;
+pub const MAPPER_VERSION: u32 = 37;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -118,6 +120,9 @@ pub struct MapperParams {
     /// Whether an image that shares nothing with more than one other gets the length of its baseline from planes of the
     /// model that go on. It applies to local models of photo sets only.
     pub continue_planes: bool,
+    /// Whether photos are asked for the focal lengths that they are told, and have others, a percent off, where these explain
+    /// the model clearly better. It applies to local models of photo sets only.
+    pub correct_told: bool,
     /// Whether panoramas are asked how their stitching stretches directions ([`CameraModel::StitchedEquirectangular`]), and
     /// have that taken out where it explains the model clearly better.
     ///
@@ -148,6 +153,7 @@ impl Default for MapperParams {
             global_bundle_growth: 1.4,
             loss_sigma: 1.0,
             continue_planes: true,
+            correct_told: true,
             calibrate_panoramas: true,
         }
     }
@@ -338,16 +344,22 @@ impl MapperOutput {
 pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
     let mut output = reconstruct_with(params, input, seed);
     let mut used = input.clone();
+    for _ in 0..MAX_CORRECTIONS {
+        let Some(largest) = output.components.first().filter(|_| params.correct_told) else { break };
+        let Some(corrected) = correct_told(params, (input, &used), largest) else { break };
+        let again = reconstruct_with(params, &corrected, seed);
+        if (registered_in(&again) as f64) < MIN_KEPT * registered_in(&output) as f64 {
+            break;
+        }
+        (output, used) = (again, corrected);
+    }
     for _ in 0..MAX_DIVISIONS {
         let Some(largest) = output.components.first() else { break };
         let division = divide(params, input, &used, largest);
         output.report.doubtful = division.doubtful;
         let Some(divided) = division.input else { break };
         let mut again = reconstruct_with(params, &divided, seed);
-        let size = |output: &MapperOutput| {
-            output.components.first().map_or(0, |component| component.registered().count())
-        };
-        if (size(&again) as f64) < MIN_KEPT * size(&output) as f64 {
+        if (registered_in(&again) as f64) < MIN_KEPT * registered_in(&output) as f64 {
             break;
         }
         again.report.doubtful.clone_from(&output.report.doubtful);
@@ -356,6 +368,13 @@ pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) ->
     output
 }
 
+/// Images of the largest component.
+fn registered_in(output: &MapperOutput) -> usize {
+    output.components.first().map_or(0, |component| component.registered().count())
+}
+
+/// How often images are mapped again with other focal lengths than they are told.
+const MAX_CORRECTIONS: usize = 2;
 /// How often images are mapped again with other cameras.
 const MAX_DIVISIONS: usize = 2;
 /// Share of the images of the largest component that has to be left with these.
@@ -525,6 +544,9 @@ fn enabled_pairs(input: &MapperInput<'_>, taken: &[bool]) -> Vec<bool> {
 /// A model keeps what agrees with it, and what it keeps holds it where it is: a panorama that came in a quarter of a
 /// degree off, half a dozen pixels, had refused the matches that would have turned it.
 const REOPENED: f64 = 8.0;
+
+/// Share of a pair's matches on the epipolar circles of a pose that make it agree with that pose.
+const MIN_ON_CIRCLES: f64 = 0.9;
 
 /// How often pairs are ranked for one component, each time without the images of those that were tried in vain.
 const MAX_STARTS: usize = 4;
@@ -980,11 +1002,12 @@ impl<'a> Mapper<'a> {
         Some(witnesses.hear(&self.model, image, world_from_camera, inliers, self.params.max_error_sigma))
     }
 
-    /// Share of an image's verified matches to registered images that belong to pairs whose rotation agrees with a pose.
+    /// Share of an image's verified matches to registered images that belong to pairs that agree with a pose.
     ///
     /// Resection from a few points in one corner, or on one plane, can settle on a pose far from the true one; the
     /// essential matrices of the same image rarely share that error. Those of a camera that was found since have another
-    /// error, and are not asked.
+    /// error, and are not asked. A pair agrees by its rotation, or by its matches: those of one wall fit two rotations, of
+    /// which verification takes either.
     fn pair_agreement(&self, image: ImageId, world_from_camera: &Rigid) -> f64 {
         if self.recalibrated[self.model.input.images[image.index()].camera.index()] {
             return 1.0;
@@ -993,11 +1016,20 @@ impl<'a> Mapper<'a> {
         for pair in self.model.input.pairs {
             let Some((other, measured)) = pair.seen_from(image) else { continue };
             let Some(pose) = &self.model.poses[other.index()] else { continue };
-            let image_from_other = world_from_camera.rotation.inverse() * pose.world_from_camera.rotation;
-            all += pair.two_view.inliers.len();
-            let deviation = image_from_other.angle_to(&measured.rotation);
-            if deviation.to_degrees() <= self.params.max_pair_rotation_deg {
-                agreeing += pair.two_view.inliers.len();
+            let image_from_other = world_from_camera.inverse() * pose.world_from_camera;
+            let matches = pair.two_view.inliers.len();
+            all += matches;
+            let deviation = image_from_other.rotation.angle_to(&measured.rotation);
+            let agrees = deviation.to_degrees() <= self.params.max_pair_rotation_deg || {
+                let is_first = pair.first == image;
+                let second_from_first = if is_first { image_from_other.inverse() } else { image_from_other };
+                let rays = [pair.first, pair.second].map(|image| &self.model.rays[image.index()]);
+                let sigmas = self.params.max_error_sigma;
+                let on_circles = count_on_circles(rays, &second_from_first, &pair.two_view.inliers, sigmas);
+                on_circles as f64 >= MIN_ON_CIRCLES * matches as f64
+            };
+            if agrees {
+                agreeing += matches;
             }
         }
         if all == 0 { 1.0 } else { agreeing as f64 / all as f64 }
@@ -1116,8 +1148,12 @@ impl<'a> Mapper<'a> {
 
 #[cfg(test)]
 mod tests {
+    use rand::Rng;
+    use setloc_features::Keypoint;
+
     use super::test_street::{POINTS, Street, first_two};
     use super::*;
+    use crate::synthetic::seeded;
     use crate::{ReconstructionImage, ReconstructionPoint, TwoView, TwoViewKind};
 
     /// The other two images agree, so nothing but the third one's own matches can turn it.
@@ -1144,6 +1180,64 @@ mod tests {
         wide.refine_within(params.limits().widened(REOPENED), 4, 20);
         wide.refine(4, 20);
         assert!(off_by(&wide) < 0.1, "{}", off_by(&wide));
+    }
+
+    /// Points of one wall fit two rotations, and verification may have taken the other one.
+    #[test]
+    fn a_pair_that_sees_one_wall_agrees_with_either_pose_that_the_wall_leaves() {
+        let mut rng = seeded("one wall");
+        let camera = Camera::equirectangular(4096, 2048);
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.4);
+        let poses = [Rigid::identity(), Rigid::new(turn, Vector3::new(2.0, 0.1, 1.0))];
+        let wall: Vec<Vector3<f64>> = (0..120)
+            .map(|_| Vector3::new(rng.random_range(-4.0..4.0), rng.random_range(-3.0..3.0), 6.0))
+            .collect();
+        let features = poses.map(|pose| {
+            let mut features = ImageFeatures { width: 4096, height: 2048, ..ImageFeatures::default() };
+            for point in &wall {
+                let pixel = camera.project(&pose.inverse_transform_point(point)).expect("sees all around");
+                let (x, y) = (pixel.x as f32, pixel.y as f32);
+                features.keypoints.push(Keypoint { x, y, size: 4.0, orientation: 0.0, noise_px: 0.3 });
+                features.colors.push([128; 3]);
+            }
+            features
+        });
+        let rays = features.each_ref().map(|features| features.rays(&camera));
+        let bearings = wall::Bearings {
+            first: &rays[0].bearings,
+            second: &rays[1].bearings,
+            sigmas_first: &rays[0].sigmas,
+            sigmas_second: &rays[1].sigmas,
+        };
+        let truth = poses[1].inverse() * poses[0];
+        let steps = wall::steps_by_wall(&bearings, 1).into_iter();
+        let both: Vec<Rigid> = steps.map(|(step, _)| step.first_from_second.inverse()).collect();
+        let off_by = |pose: &Rigid| pose.rotation.angle_to(&truth.rotation).to_degrees();
+        let other = both.iter().find(|pose| off_by(pose) > 10.0).expect("the wall leaves another pose");
+        let two_view = TwoView {
+            kind: TwoViewKind::General,
+            second_from_first: *other,
+            inliers: (0..120).map(|at| Match { first: at, second: at }).collect(),
+            median_parallax_rad: 0.3,
+        };
+        let pairs = [PairGeometry { first: ImageId(0), second: ImageId(1), two_view }];
+        let input = MapperInput {
+            cameras: vec![camera.clone()],
+            calibrations: vec![Calibration::Known],
+            images: features.iter().map(|features| InputImage::new("photo", CameraId(0), features)).collect(),
+            pairs: &pairs,
+            putative: &[],
+            two_view: TwoViewParams::default(),
+        };
+        let mut model = Model::new(&input);
+        model.set_pose(ImageId(0), Some(poses[0]));
+        let params = MapperParams::default();
+        let mapper = Mapper::over(&params, model, vec![false; 2], 0);
+        assert_eq!(mapper.pair_agreement(ImageId(1), &poses[1]), 1.0);
+        assert_eq!(mapper.pair_agreement(ImageId(1), &other.inverse()), 1.0);
+        let askew = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.2);
+        let askew = Rigid::new(askew * poses[1].rotation, poses[1].translation);
+        assert_eq!(mapper.pair_agreement(ImageId(1), &askew), 0.0);
     }
 
     #[test]

@@ -57,7 +57,14 @@ pub struct PairDisagreement {
 impl PairDisagreement {
     /// Whether so many matches cannot be what the model has that they speak against it by themselves.
     fn is_heavy(&self) -> bool {
-        self.matches >= HEAVY_MATCHES && (self.is_unused() || self.rotation_deg > HEAVY_ROTATION_DEG)
+        let is_turned = self.rotation_deg > HEAVY_ROTATION_DEG && !self.is_explained();
+        self.matches >= HEAVY_MATCHES && (self.is_unused() || is_turned)
+    }
+
+    /// Whether most of what the pair shares became points of the model: then these matches fit it, and the pair's own rotation is the
+    /// other one of the two that the matches of a wall leave.
+    fn is_explained(&self) -> bool {
+        self.used * 2 >= self.matches
     }
 
     /// Whether next to nothing of what the pair shares became points of the model.
@@ -259,7 +266,9 @@ pub fn assess(
                 .angle_to(&two_view.second_from_first.rotation)
                 .to_degrees(),
         };
-        let is_turned = found.rotation_deg > params.max_rotation_deg && two_view.kind == TwoViewKind::General;
+        let is_turned = found.rotation_deg > params.max_rotation_deg
+            && two_view.kind == TwoViewKind::General
+            && !found.is_explained();
         let agrees = !found.is_unused() && !is_turned;
         if two_view.kind == TwoViewKind::PureRotation && found.rotation_deg <= params.max_rotation_deg {
             turned.insert((pair.first, pair.second));
@@ -579,6 +588,8 @@ mod tests {
         };
         assert!(pair(300, 20, 0.5).is_heavy() && pair(300, 90, 90.0).is_heavy());
         assert!(!pair(300, 90, 8.0).is_heavy() && !pair(40, 0, 90.0).is_heavy());
+        // Most of them are points of the model: the pair has the other rotation that a wall leaves.
+        assert!(!pair(300, 200, 80.0).is_heavy());
     }
 
     #[test]

@@ -39,7 +39,11 @@ const SCALE_STEP: f64 = 1.03;
 /// Scales about the best that are tried once more, as the number of steps to each side and the factor.
 const FINE_STEPS: i32 = 9;
 const FINE_STEP: f64 = 1.006;
-/// Correlation of patches that count.
+/// Correlation of patches that count when scales are compared. What looks alike by chance (courses of bricks, floors of a car park)
+/// is mostly less so: from 0.75 on, the right scale of five sets had 1.3–13 times as many as any other, from 0.85 on 2.1–18
+/// times.
+const MIN_ALIKE: f64 = 0.85;
+/// Correlation of patches that are placed.
 const MIN_CORRELATION: f64 = 0.75;
 /// The same of a patch of few, coarse samples, below which it is not looked at closer.
 const MIN_COARSE: f64 = 0.5;
@@ -287,7 +291,7 @@ impl<'a> Sweep<'a> {
     fn shown(&self, scale: f64) -> (usize, f64) {
         let alike = |photo: usize, spot: &Spot| {
             let laid = self.laid(photo, spot, scale)?;
-            (laid.correlation >= MIN_CORRELATION).then_some(laid.correlation - MIN_CORRELATION / 2.0)
+            (laid.correlation >= MIN_ALIKE).then_some(laid.correlation - MIN_ALIKE / 2.0)
         };
         let of_photo = |photo: usize| -> Vec<f64> {
             self.spots[photo].par_iter().with_min_len(64).filter_map(|spot| alike(photo, spot)).collect()

@@ -421,6 +421,33 @@ fn the_unknown_focal_length_and_distortion_of_photos_are_found() {
 }
 
 #[test]
+fn focal_lengths_that_are_told_two_percent_wrong_are_corrected_and_right_ones_kept() {
+    let camera = |focal: f64| radial(1600, 1200, focal, [-0.05, 0.01]);
+    let truth = camera(1250.0);
+    let views = (0..30).map(|k| {
+        let yaw = 1.0 + 0.35 * (0.9 * f64::from(k)).sin();
+        let center = Vector3::new(1.5 * f64::from(k).sin(), 0.1 * f64::from(k % 3), 1.5 * f64::from(k));
+        (truth.clone(), Rigid::new(UnitQuaternion::from_euler_angles(0.0, yaw, 0.0), center))
+    });
+    // The noise that the keypoints state.
+    let street = Street::new(views.collect(), 1.0, 0, 3);
+    let found = |told: &Camera| {
+        let output = street.map(&vec![told.clone(); 30], Calibration::Known);
+        let (registered, worst_m, _) = street.errors(&output);
+        assert_eq!(registered, 30);
+        (output.components[0].cameras[0].clone(), worst_m)
+    };
+    let (corrected, worst_m) = found(&camera(1275.0));
+    assert!((corrected.focal_length() / 1250.0 - 1.0).abs() < 1e-3, "{corrected:?}");
+    assert_eq!(corrected.params[1..], truth.params[1..]);
+    let (kept, at_best_m) = found(&truth);
+    assert_eq!(kept, truth);
+    assert!(worst_m < 1.5 * at_best_m, "{worst_m} m, {at_best_m} m where it is told rightly");
+    // What is a tenth off is no matter of calibration.
+    assert_eq!(found(&camera(1375.0)).0, camera(1375.0));
+}
+
+#[test]
 fn photos_turned_on_the_spot_are_mapped_as_one_standpoint() {
     // Looking at one side of the street only, every other photo turned back by 20°: those share most of what they
     // see, without parallax.

@@ -22,7 +22,8 @@ use crate::evidence::{
 };
 use crate::guided::guided_matches;
 use crate::refine::{
-    JointCamera, JointModel, JointObservations, JointPhoto, SceneView, Sighting, TiedPoint, refine_jointly,
+    JointCamera, JointModel, JointObservations, JointPhoto, KnownOfCamera, SceneView, Sighting, TiedPoint,
+    refine_jointly,
 };
 use crate::single::{inliers, union};
 use crate::types::DOUBTFUL;
@@ -257,6 +258,7 @@ impl Component<'_> {
         }
         let names: Vec<&str> = self.members.iter().map(|&photo| self.photos[photo].name).collect();
         let mut remarks = vec![format!("{}: {}", called(&names, self.scene.component), reasons.join("; "))];
+        remarks.extend(self.contradicted_cameras());
         remarks.extend(self.lengths().map(|(slots, length)| self.basis(slots, &length)));
         let mut rigid_answers =
             self.rigid_answers(&set_from_camera, &candidates, &rigid, rigid_support, &reasons);
@@ -540,9 +542,8 @@ impl Component<'_> {
         walls: &[WallSight],
     ) -> Joint {
         let world_from_set = &rigid.world_from_set;
-        let cameras = self.model.cameras.iter().cloned().zip(self.fixed_cameras());
         let mut model = JointModel {
-            cameras: cameras.map(|(camera, is_known)| JointCamera::new(camera, is_known)).collect(),
+            cameras: self.joint_cameras(),
             photos: set_from_camera
                 .iter()
                 .enumerate()
@@ -654,13 +655,39 @@ impl Component<'_> {
         (0..sights.all.len()).filter(agrees).collect()
     }
 
-    /// A camera is known when all photos that share it say so.
-    fn fixed_cameras(&self) -> Vec<bool> {
-        let mut fixed = vec![true; self.model.cameras.len()];
-        for (slot, &photo) in self.members.iter().enumerate() {
-            fixed[self.camera_of(slot)] &= self.photos[photo].calibration == Calibration::Known;
-        }
-        fixed
+    /// A camera is known when all photos that share it say so, but for focal lengths that the local model contradicts.
+    fn joint_cameras(&self) -> Vec<JointCamera> {
+        let known = |at: usize, camera: &Camera| {
+            let mut photos = (0..self.members.len())
+                .filter(|&slot| self.camera_of(slot) == at)
+                .map(|slot| &self.photos[self.members[slot]]);
+            if photos.clone().any(|photo| photo.calibration != Calibration::Known) {
+                KnownOfCamera::Usual
+            } else if photos.any(|photo| photo.camera != camera) {
+                KnownOfCamera::AllButFocal(camera.clone())
+            } else {
+                KnownOfCamera::Intrinsics
+            }
+        };
+        let cameras = self.model.cameras.iter().enumerate();
+        cameras.map(|(at, camera)| JointCamera { known: known(at, camera), camera: camera.clone() }).collect()
+    }
+
+    /// What the local model shows of focal lengths that were told otherwise, in words.
+    fn contradicted_cameras(&self) -> Vec<String> {
+        let contradicted = |(at, camera): (usize, JointCamera)| {
+            let KnownOfCamera::AllButFocal(shown) = camera.known else { return None };
+            let photos = (0..self.members.len()).filter(|&slot| self.camera_of(slot) == at);
+            let photos: Vec<_> = photos.map(|slot| &self.photos[self.members[slot]]).collect();
+            let (told, shown) = (photos.first()?.camera.focal_length(), shown.focal_length());
+            let names: Vec<&str> = photos.iter().map(|photo| photo.name).collect();
+            Some(format!(
+                "the focal length that is told for {} is {told:.1} px; together they show {shown:.1} px ({:+.1} %), which is used",
+                names.join(", "),
+                100.0 * (shown / told - 1.0)
+            ))
+        };
+        self.joint_cameras().into_iter().enumerate().filter_map(contradicted).collect()
     }
 
     /// Correspondences that agree with the rigid pose, as they are.

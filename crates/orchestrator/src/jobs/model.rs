@@ -78,6 +78,7 @@ pub fn add_model(
         cameras.of_image.iter().zip(positions).map(|(camera, position)| json!([camera, position])).collect();
     let mapper = MapperParams {
         continue_planes: config.sfm.continue_planes && kind == ModelKind::Local,
+        correct_told: config.sfm.correct_told && kind == ModelKind::Local,
         ..config.sfm.clone()
     };
     let params = json!({

@@ -157,6 +157,24 @@ impl CameraPrior {
         Some(prior)
     }
 
+    /// That the focal lengths are within 1 % of this camera's, as a calibration tells them, and their ratio within 0.1 %.
+    ///
+    /// A calibration is made at one focus and one temperature. Pixels of another ratio than 1 are looser by what they differ.
+    pub fn told(index: u32, camera: &Camera) -> Self {
+        let known = |(role, &value): (&ParamRole, &f64)| {
+            let sigma = if *role == ParamRole::Focal { ALIKE_FOCAL * value } else { f64::INFINITY };
+            ParameterEstimate { value, sigma }
+        };
+        let roles = camera.param_roles();
+        let parameters = roles.iter().zip(&camera.params).map(known).collect();
+        let focal = roles.iter().zip(&camera.params).filter(|(role, _)| **role == ParamRole::Focal);
+        let [shortest, longest] = focal
+            .map(|(_, focal)| *focal)
+            .fold([f64::INFINITY, 0.0], |[low, high], focal| [focal.min(low), focal.max(high)]);
+        let aspect_sigma = 0.001_f64.hypot(longest / shortest - 1.0);
+        Self { camera: index, parameters, aspect_sigma, loss: RobustLoss::Trivial }
+    }
+
     /// Whether it is one of this camera, in numbers that can be weighed.
     pub(super) fn fits(&self, camera: Option<&Camera>) -> bool {
         camera.is_some_and(|camera| camera.params.len() == self.parameters.len())

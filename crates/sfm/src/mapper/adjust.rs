@@ -17,14 +17,29 @@ pub(super) struct Scope {
     pub free_images: Vec<ImageId>,
     /// Points to adjust, with all their observations.
     pub points: Vec<PointId>,
-    /// Whether unknown intrinsics move.
-    pub intrinsics: bool,
+    /// Which intrinsics move.
+    pub intrinsics: Intrinsics,
+}
+
+/// Which intrinsics an adjustment moves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Intrinsics {
+    /// None.
+    None,
+    /// Those that are not known.
+    Unknown,
+    /// The focal lengths of this camera, which are told.
+    Told(usize),
 }
 
 impl Scope {
     /// Everything.
     pub fn global(model: &Model<'_>) -> Self {
-        Self { free_images: model.registered().collect(), points: model.live_ids(), intrinsics: true }
+        Self {
+            free_images: model.registered().collect(),
+            points: model.live_ids(),
+            intrinsics: Intrinsics::Unknown,
+        }
     }
 
     /// `image` and the `neighbours` images that share most points with it, with all points that any of them sees: what a
@@ -42,7 +57,7 @@ impl Scope {
         others.truncate(neighbours);
         others.push(image);
         let points = model.seen_by(&others);
-        Self { free_images: others, points, intrinsics: false }
+        Self { free_images: others, points, intrinsics: Intrinsics::None }
     }
 }
 
@@ -85,13 +100,20 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
     if hold_first && let Some(first) = model.registered().next() {
         free[first.index()] = false;
     }
-    if scope.intrinsics {
-        for camera in 0..model.cameras.len() {
-            if model.is_open(camera) && tells_camera(model, &model.registered_with(camera)) {
-                problem.camera_freedom[camera] = IntrinsicsFreedom::FREE;
-                let usual = CameraPrior::of_usual_photo(camera as u32, &model.cameras[camera]);
-                problem.camera_priors.extend(usual);
+    match scope.intrinsics {
+        Intrinsics::None => {}
+        Intrinsics::Unknown => {
+            for camera in 0..model.cameras.len() {
+                if model.is_open(camera) && tells_camera(model, &model.registered_with(camera)) {
+                    problem.camera_freedom[camera] = IntrinsicsFreedom::FREE;
+                    let usual = CameraPrior::of_usual_photo(camera as u32, &model.cameras[camera]);
+                    problem.camera_priors.extend(usual);
+                }
             }
+        }
+        Intrinsics::Told(camera) => {
+            problem.camera_freedom[camera] = IntrinsicsFreedom { focal: true, ..IntrinsicsFreedom::FIXED };
+            problem.camera_priors.push(CameraPrior::told(camera as u32, &model.input.cameras[camera]));
         }
     }
 

@@ -25,6 +25,7 @@ use super::{
     corner::PairByWall,
     model::Model,
     plane::{Plane, SeenPoint, find_planes},
+    witnesses::count_on_circles,
 };
 use crate::{
     BaselineLength, ImageId, Observation, Rigid, StepPose,
@@ -141,8 +142,12 @@ pub(super) fn continue_planes(
     let is_step = |length: f64| (MAX_STEP_RATIO.recip()..=MAX_STEP_RATIO).contains(&(length / baseline));
     let scene = Surroundings::new(&known, &planes);
     let measured =
-        PairByWall::find(model, image, other, (image_from_other, verified), &scene, baseline, seed)
-            .filter(|found| is_step(found.measured.pair.second_from_first().translation.norm()));
+        PairByWall::find(model, image, other, (image_from_other, verified), &scene, baseline, seed).filter(
+            |found| {
+                let step = found.measured.pair.second_from_first();
+                is_step(step.translation.norm()) && explains(model, [other, image], &step, verified)
+            },
+        );
     let (step, either, votes, matches) = if let Some(found) = measured {
         let (step, either) = found.step();
         (step, either, found.votes, found.matches)
@@ -170,6 +175,15 @@ pub(super) fn continue_planes(
         },
         matches,
     })
+}
+
+/// Least share of the verified matches that a wall's pose must have on its circles: who sees two walls is told by both.
+const MIN_ON_CIRCLES: f64 = 0.8;
+
+fn explains(model: &Model<'_>, images: [ImageId; 2], second_from_first: &Rigid, verified: &[Match]) -> bool {
+    let rays = images.map(|image| &model.rays[image.index()]);
+    let on_circles = count_on_circles(rays, second_from_first, verified, RANSAC.max_error_sigma);
+    on_circles as f64 >= MIN_ON_CIRCLES * verified.len() as f64
 }
 
 /// Standard deviations of the direction of a baseline and of the rotation where no homography tells them.
