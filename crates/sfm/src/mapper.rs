@@ -340,7 +340,8 @@ impl MapperOutput {
 /// with the first baseline as unit of length, until it is georegistered.
 ///
 /// Where images turn out not to share the camera that they were given as one, they are mapped again with several, unless it is
-/// known or a bare guess: see [`MapperOutput::components`] and [`MapperReport::doubtful`].
+/// known or a bare guess: see [`MapperOutput::components`] and [`MapperReport::doubtful`]. Focal lengths that are told and that the
+/// largest component contradicts are replaced, and all is mapped again: see [`MapperParams::correct_told`].
 pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
     let mut output = reconstruct_with(params, input, seed);
     let mut used = input.clone();

@@ -38,7 +38,7 @@ const MIN_SHARE: f64 = 0.05;
 /// Draws of the errors.
 const DRAWS: u32 = 16;
 /// Relative decrease of the cost that ends the adjustment of a draw. What is left then is 4 % of what the draw moves, where sixteen
-/// draws tell a deviation to 18 %, and takes two fifths of the steps.
+/// draws tell a deviation to 18 %, and spares a third of the steps.
 const DRAW_TOLERANCE: f64 = 1e-4;
 /// Waves that a field is the sum of.
 const WAVES: usize = 24;
