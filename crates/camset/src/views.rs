@@ -7,7 +7,7 @@
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use setloc_features::{ImageFeatures, MatchParams, match_features};
+use setloc_features::{ImageFeatures, MatchParams, Posture, match_features};
 use setloc_sfm::{ImageId, Observation, Rigid, TwoViewKind, TwoViewParams, verify_pair};
 
 use crate::{Pictures, QueryPhoto, Scene, SingleLocalization};
@@ -114,7 +114,7 @@ pub fn match_views(
     let matched = |&(photo, image): &(usize, ImageId)| {
         let query = &photos[photo];
         let features = views.get(image.index()).and_then(Option::as_ref)?;
-        let matches = match_features(matching, query.features, features);
+        let matches = match_features(matching, Posture::Any, query.features, features);
         let own = query.features.rays_of(query.camera, matches.iter().map(|m| m.first));
         let camera = scene.reconstruction.camera_of(image);
         let theirs = features.rays_of(camera, matches.iter().map(|m| m.second));

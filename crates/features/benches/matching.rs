@@ -7,7 +7,7 @@ use std::hint::black_box;
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{DESCRIPTOR_LEN, ImageFeatures, MatchParams, match_features, two_nearest};
+use setloc_features::{DESCRIPTOR_LEN, ImageFeatures, MatchParams, Posture, match_features, two_nearest};
 
 /// Descriptors of random directions with the stored norm, as RootSIFT's are.
 fn random_features(seed: u64, count: usize) -> ImageFeatures {
@@ -29,7 +29,7 @@ fn random_features(seed: u64, count: usize) -> ImageFeatures {
 #[cfg(target_arch = "x86_64")]
 mod peak {
     use std::arch::x86_64::{
-        __m256i, __m512i, _mm256_add_epi32, _mm256_madd_epi16, _mm256_set1_epi32, _mm256_setzero_si256,
+        __m256i, __m512i, _mm256_add_epi16, _mm256_maddubs_epi16, _mm256_set1_epi32, _mm256_setzero_si256,
         _mm512_dpbusd_epi32, _mm512_set1_epi32, _mm512_setzero_si512,
     };
     use std::hint::black_box;
@@ -47,7 +47,7 @@ mod peak {
             Some(("vpdpbusd zmm", loops * 64, || unsafe { vnni() }))
         } else if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the instructions are there, as just checked.
-            Some(("vpmaddwd ymm", loops * 16, || unsafe { madd() }))
+            Some(("vpmaddubsw ymm", loops * 32, || unsafe { maddubs() }))
         } else {
             None
         }
@@ -66,16 +66,16 @@ mod peak {
     }
 
     #[target_feature(enable = "avx2")]
-    fn madd() {
-        let (a, b) = (_mm256_set1_epi32(black_box(0x0002_0003)), _mm256_set1_epi32(black_box(0x0005_0006)));
+    fn maddubs() {
+        let a = _mm256_set1_epi32(black_box(0x0102_0304));
         let mut sums: [__m256i; ACCUMULATORS] = [_mm256_setzero_si256(); ACCUMULATORS];
         for _ in 0..STEPS {
             for sum in &mut sums {
                 // The factor depends on the sum, so that the product cannot be taken out of the loop.
-                *sum = _mm256_add_epi32(*sum, _mm256_madd_epi16(*sum, a));
+                *sum = _mm256_add_epi16(*sum, _mm256_maddubs_epi16(*sum, a));
             }
         }
-        black_box((sums, b));
+        black_box(sums);
     }
 }
 
@@ -90,12 +90,18 @@ fn matching(criterion: &mut Criterion) {
     for count in [1024, 8192] {
         let (first, second) = (random_features(1, count), random_features(2, count));
         group.throughput(Throughput::Elements((count * count * DESCRIPTOR_LEN) as u64));
-        group.bench_function(format!("two_nearest {count}×{count}"), |bencher| {
-            bencher.iter(|| two_nearest(black_box(&first.descriptors), black_box(&second.descriptors)));
-        });
+        // All 8 bits of a byte, and 7, as pairs of images are matched.
+        for bits in [8, 7] {
+            let [first, second] = [&first, &second].map(|features| -> Vec<u8> {
+                features.descriptors.iter().map(|byte| byte >> (8 - bits)).collect()
+            });
+            group.bench_function(format!("two_nearest {count}×{count}, {bits} bits"), |bencher| {
+                bencher.iter(|| two_nearest(black_box(&first), black_box(&second)));
+            });
+        }
         group.bench_function(format!("match_features mutual {count}×{count}"), |bencher| {
             let params = MatchParams::default();
-            bencher.iter(|| match_features(&params, black_box(&first), black_box(&second)));
+            bencher.iter(|| match_features(&params, Posture::Any, black_box(&first), black_box(&second)));
         });
     }
     group.finish();

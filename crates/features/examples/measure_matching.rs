@@ -14,8 +14,8 @@ use std::time::Instant;
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use serde_json::Value;
 use setloc_features::{
-    Camera, DecodeLimits, FeatureParams, GuidedParams, ImageFeatures, ImageInfo, Match, MatchParams, Rays,
-    decode, extract, guess_camera, match_features, match_guided,
+    Camera, DecodeLimits, FeatureParams, GuidedParams, ImageFeatures, ImageInfo, Match, MatchParams, Posture,
+    Rays, decode, extract, guess_camera, match_features, match_guided,
 };
 
 /// A match further than this from its epipolar plane is wrong.
@@ -27,6 +27,7 @@ const SEAM_DEG: f64 = 5.0;
 
 struct Image {
     name: String,
+    camera: Camera,
     features: ImageFeatures,
     rays: Rays,
 }
@@ -75,13 +76,14 @@ fn main() -> Result<(), Box<dyn Error>> {
             begin.elapsed().saturating_sub(decoded)
         );
         let rays = features.rays(&camera);
-        images.push(Image { name, features, rays });
+        images.push(Image { name, camera, features, rays });
     }
     let mut angles_by_size: Vec<(f32, f64, f64)> = Vec::new();
     let mut by_place = ByPlace::default();
     for pair in images.windows(2) {
         let begin = Instant::now();
-        let matches = match_features(&MatchParams::default(), &pair[0].features, &pair[1].features);
+        let posture = Posture::of([&pair[0].camera, &pair[1].camera]);
+        let matches = match_features(&MatchParams::default(), posture, &pair[0].features, &pair[1].features);
         print!("{} – {}: {} matches in {:.1?}", pair[0].name, pair[1].name, matches.len(), begin.elapsed());
         if let Some(essential) =
             truth.as_ref().and_then(|truth| essential(truth, &pair[0].name, &pair[1].name))

@@ -425,7 +425,7 @@ mod tests {
     use nalgebra::Vector2;
 
     use super::*;
-    use crate::{DESCRIPTOR_LEN, MatchParams, match_features};
+    use crate::{DESCRIPTOR_LEN, MatchParams, Posture, match_features};
 
     const BLOB: f64 = 4.0;
 
@@ -547,7 +547,7 @@ mod tests {
             let params = FeatureParams { simulated_tilt, ..FeatureParams::default() };
             let first = extract(&params, &straight, &photo(900, 300), None).unwrap();
             let second = extract(&params, &slanted, &photo(300, 300), None).unwrap();
-            let matches = match_features(&MatchParams::default(), &first, &second);
+            let matches = match_features(&MatchParams::default(), Posture::Any, &first, &second);
             let near = matches.iter().filter(|m| {
                 let (a, b) = (first.keypoints[m.first as usize], second.keypoints[m.second as usize]);
                 (a.x / TILT as f32 - b.x).abs() < 2.0 && (a.y - b.y).abs() < 2.0

@@ -24,7 +24,7 @@
 //!
 //! ```
 //! use setloc_features::{
-//!     DecodedImage, FeatureParams, ImageInfo, MatchParams, extract, guess_camera, match_features,
+//!     DecodedImage, FeatureParams, ImageInfo, MatchParams, Posture, extract, guess_camera, match_features,
 //! };
 //!
 //! # fn main() -> Result<(), setloc_features::FeatureError> {
@@ -36,7 +36,7 @@
 //! let features = extract(&FeatureParams::default(), &image, &camera, None)?;
 //! let rays = features.rays(&camera);
 //! assert_eq!(rays.bearings.len(), features.len());
-//! let matches = match_features(&MatchParams::default(), &features, &features);
+//! let matches = match_features(&MatchParams::default(), Posture::of([&camera; 2]), &features, &features);
 //! assert!(matches.iter().all(|found| found.first == found.second));
 //! # Ok(())
 //! # }
@@ -67,7 +67,7 @@ pub use features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Keypoint, Ray
 pub use geodesy::Wgs84;
 pub use mask::Mask;
 pub use matching::{
-    DescriptorBlock, GuidedParams, Match, MatchParams, TwoNearest, match_features, match_guided,
+    DescriptorBlock, GuidedParams, Match, MatchParams, Posture, TwoNearest, match_features, match_guided,
     squared_distance, two_nearest,
 };
 pub use nearby::NearbyKeypoints;

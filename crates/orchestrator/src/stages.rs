@@ -6,8 +6,8 @@ use anyhow::Result;
 use setloc_town::TownParams;
 
 pub use setloc_features::{
-    DecodeLimits, DecodedImage, FeatureParams, ImageInfo, ImagePyramid, Mask, MatchParams, decode, extract,
-    guess_camera, match_features, probe,
+    DecodeLimits, DecodedImage, FeatureParams, ImageInfo, ImagePyramid, Mask, MatchParams, Posture, decode,
+    extract, guess_camera, match_features, probe,
 };
 
 /// Version of decoding and extraction; part of the fingerprint of `features` jobs.

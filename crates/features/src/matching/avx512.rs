@@ -9,7 +9,7 @@ use std::arch::x86_64::{
 };
 
 use super::kernel::{Line, PackedBase, PackedQueries, Slots};
-use super::tiles::{self, Instructions, VECTORS};
+use super::tiles::{self, Instructions, Lanes, Products, VECTORS};
 
 /// Queries per register tile; with 2 base vectors that makes 24 accumulators of the 32 registers.
 const ROWS: usize = 12;
@@ -81,13 +81,18 @@ fn search<const COLUMNS: bool>(
 
 // SAFETY of all intrinsics: `self` proves that the instructions are there.
 impl Instructions<ROWS, LANES> for Avx512 {
-    type Vector = __m512i;
+    type Lanes = Self;
     const QUERY_LINES: usize = 2;
     const BASE_LINES: usize = STEPS;
     const TILE: usize = 128;
 
     #[inline(always)]
-    fn multiply(self, queries: &[Line], base: &[Line]) -> [[__m512i; VECTORS]; ROWS] {
+    fn lanes(self) -> Self {
+        self
+    }
+
+    #[inline(always)]
+    fn multiply(self, queries: &[Line], base: &[Line]) -> Products<Self, ROWS, LANES> {
         let queries: &[[i32; STEPS]] = bytemuck::cast_slice(queries);
         let queries: &[[i32; STEPS]; ROWS] = queries.try_into().expect("a full tile of queries");
         let (left, right) = base.split_at(STEPS);
@@ -108,6 +113,11 @@ impl Instructions<ROWS, LANES> for Avx512 {
         }
         products
     }
+}
+
+// SAFETY of all intrinsics: as above.
+impl Lanes<LANES> for Avx512 {
+    type Vector = __m512i;
 
     #[inline(always)]
     fn splat(self, value: i32) -> __m512i {

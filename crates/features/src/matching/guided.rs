@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::kernel::{TwoNearest, squared_distance};
 use super::{Match, Parts, collect, match_simulated, passes};
-use crate::{DESCRIPTOR_LEN, ImageFeatures, Rays};
+use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Rays};
 
 /// How to match two images of known relative pose.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -99,7 +99,8 @@ fn match_parts_guided(
             backward[candidate as usize].offer(index as u32, distance2);
         }
     }
-    let accepts = |nearest: &TwoNearest| passes(nearest, params.ratio, params.max_distance);
+    let max_distance = params.max_distance * f64::from(DESCRIPTOR_NORM);
+    let accepts = |nearest: &TwoNearest| passes(nearest, params.ratio, max_distance);
     let matches = collect(&forward, accepts, |first, second| {
         let back = &backward[second as usize];
         back.index == first && accepts(back)

@@ -6,11 +6,16 @@
 //! matching, of its columns (base) in the same pass. A comparison with the second-best distances skips nearly all
 //! updates, so the product dominates.
 
+use std::ops::Range;
+
 use bytemuck::{Pod, Zeroable};
 
 use super::count;
 #[cfg(target_arch = "x86_64")]
-use super::{avx2::Avx2, avx512::Avx512};
+use super::{
+    avx2::{self, Avx2},
+    avx512::Avx512,
+};
 use crate::DESCRIPTOR_LEN;
 
 /// Distance of a slot that has seen nothing: above every real squared distance (128 · 255² < 2²³).
@@ -66,25 +71,48 @@ impl TwoNearest {
 pub(super) enum Kernel {
     Scalar,
     #[cfg(target_arch = "x86_64")]
-    Avx2(Avx2),
+    Avx2Words(avx2::Words),
+    /// For [short](avx2::is_short) descriptors only.
+    #[cfg(target_arch = "x86_64")]
+    Avx2Bytes(avx2::Bytes),
     #[cfg(target_arch = "x86_64")]
     Avx512(Avx512),
 }
 
 impl Kernel {
+    /// The fastest for any descriptors.
     pub fn detect() -> Self {
         #[cfg(target_arch = "x86_64")]
-        if let Some(kernel) = Avx512::detect().map(Self::Avx512).or_else(|| Avx2::detect().map(Self::Avx2)) {
-            return kernel;
+        {
+            let avx2 = || Avx2::detect().map(|avx2| Self::Avx2Words(avx2.words()));
+            if let Some(kernel) = Avx512::detect().map(Self::Avx512).or_else(avx2) {
+                return kernel;
+            }
         }
         Self::Scalar
+    }
+
+    /// The fastest for these descriptors.
+    fn detect_for(queries: &[u8], base: &[u8]) -> Self {
+        let any = Self::detect();
+        #[cfg(target_arch = "x86_64")]
+        if let Self::Avx2Words(_) = any
+            && let Some(avx2) = Avx2::detect()
+            && avx2::is_short(queries)
+            && avx2::is_short(base)
+        {
+            return Self::Avx2Bytes(avx2.bytes());
+        }
+        any
     }
 
     fn pack_base(self, descriptors: &[u8]) -> PackedBase {
         match self {
             Self::Scalar => PackedBase { lines: lines_of(descriptors), terms: terms_of(descriptors) },
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2(_) => Avx2::pack_base(descriptors),
+            Self::Avx2Words(_) => avx2::Words::pack_base(descriptors),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2Bytes(_) => avx2::Bytes::pack_base(descriptors),
             #[cfg(target_arch = "x86_64")]
             Self::Avx512(_) => Avx512::pack_base(descriptors),
         }
@@ -94,7 +122,9 @@ impl Kernel {
         match self {
             Self::Scalar => PackedQueries::new(descriptors, 1, |value| value),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2(_) => Avx2::pack_queries(descriptors),
+            Self::Avx2Words(_) => avx2::Words::pack_queries(descriptors),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2Bytes(_) => avx2::Bytes::pack_queries(descriptors),
             #[cfg(target_arch = "x86_64")]
             Self::Avx512(_) => Avx512::pack_queries(descriptors),
         }
@@ -111,7 +141,9 @@ impl Kernel {
         match self {
             Self::Scalar => search_scalar(queries, base, rows, columns),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2(kernel) => kernel.search(queries, base, rows, columns, both),
+            Self::Avx2Words(kernel) => avx2::search(kernel, queries, base, rows, columns, both),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2Bytes(kernel) => avx2::search(kernel, queries, base, rows, columns, both),
             #[cfg(target_arch = "x86_64")]
             Self::Avx512(kernel) => kernel.search(queries, base, rows, columns, both),
         }
@@ -158,13 +190,15 @@ pub(super) struct Slots {
     pub best: Vec<i32>,
     pub second: Vec<i32>,
     pub index: Vec<u32>,
+    /// Number of the first descriptor that is searched.
+    pub first_index: u32,
 }
 
 impl Slots {
     fn new(len: usize, padded: usize) -> Self {
         let mut second = vec![UNSEEN; len];
         second.resize(padded, i32::MIN);
-        Self { best: vec![UNSEEN; padded], second, index: vec![TwoNearest::NO_INDEX; padded] }
+        Self { best: vec![UNSEEN; padded], second, index: vec![TwoNearest::NO_INDEX; padded], first_index: 0 }
     }
 
     #[inline(always)]
@@ -172,7 +206,7 @@ impl Slots {
         if distance2 < self.best[slot] {
             self.second[slot] = self.best[slot];
             self.best[slot] = distance2;
-            self.index[slot] = index as u32;
+            self.index[slot] = self.first_index + index as u32;
         } else if distance2 < self.second[slot] {
             self.second[slot] = distance2;
         }
@@ -268,12 +302,49 @@ impl DescriptorBlock {
 
 /// The two nearest of `base` for each of `queries` (both row-major, `n × DESCRIPTOR_LEN` bytes).
 pub fn two_nearest(queries: &[u8], base: &[u8]) -> Vec<TwoNearest> {
-    DescriptorBlock::new(base).two_nearest(queries)
+    DescriptorBlock::with_kernel(Kernel::detect_for(queries, base), base).two_nearest(queries)
 }
 
 /// Both directions in one pass: for each query its nearest two of `base`, for each of `base` its nearest two queries.
 pub(super) fn two_nearest_both(queries: &[u8], base: &[u8]) -> (Vec<TwoNearest>, Vec<TwoNearest>) {
-    DescriptorBlock::new(base).search(queries, true)
+    DescriptorBlock::with_kernel(Kernel::detect_for(queries, base), base).search(queries, true)
+}
+
+/// [`two_nearest_both`] of descriptors that lie in groups, comparing only groups of which `compares` says so.
+///
+/// Groups are adjacent, given by where they end. At equal distance the earlier group wins, and in it the lower index.
+pub(super) fn two_nearest_of_groups(
+    (queries, query_ends): (&[u8], &[usize]),
+    (base, base_ends): (&[u8], &[usize]),
+    compares: impl Fn(usize, usize) -> bool,
+) -> (Vec<TwoNearest>, Vec<TwoNearest>) {
+    let kernel = Kernel::detect_for(queries, base);
+    let groups_of = |ends: &[usize]| -> Vec<Range<usize>> {
+        let starts = std::iter::once(0).chain(ends.iter().copied());
+        starts.zip(ends).map(|(start, &end)| start..end).collect()
+    };
+    let bytes = |group: &Range<usize>| group.start * DESCRIPTOR_LEN..group.end * DESCRIPTOR_LEN;
+    let (query_groups, base_groups) = (groups_of(query_ends), groups_of(base_ends));
+    let blocks: Vec<DescriptorBlock> =
+        base_groups.iter().map(|group| DescriptorBlock::with_kernel(kernel, &base[bytes(group)])).collect();
+    // Best distances are carried on from group to group: nearly nothing is an update then.
+    let mut columns: Vec<Slots> =
+        blocks.iter().map(|block| Slots::new(block.len, block.base.terms.len())).collect();
+    let mut nearest_of_queries = Vec::with_capacity(count(queries));
+    for (at, query_group) in query_groups.iter().enumerate() {
+        let packed = kernel.pack_queries(&queries[bytes(query_group)]);
+        let mut rows = Slots::new(query_group.len(), packed.terms.len());
+        for (of, (base_group, block)) in base_groups.iter().zip(&blocks).enumerate() {
+            if compares(at, of) {
+                rows.first_index = base_group.start as u32;
+                columns[of].first_index = query_group.start as u32;
+                kernel.search(&packed, &block.base, &mut rows, &mut columns[of], true);
+            }
+        }
+        nearest_of_queries.extend(rows.finish(query_group.len()));
+    }
+    let of_base = columns.iter().zip(&blocks).flat_map(|(slots, block)| slots.finish(block.len));
+    (nearest_of_queries, of_base.collect())
 }
 
 pub(super) fn squared_norm(descriptor: &[u8]) -> i32 {
@@ -316,11 +387,15 @@ mod tests {
 
     use super::*;
 
-    fn kernels() -> Vec<Kernel> {
+    /// All that the processor has for these descriptors.
+    fn kernels(queries: &[u8], base: &[u8]) -> Vec<Kernel> {
         let mut kernels = vec![Kernel::Scalar];
         #[cfg(target_arch = "x86_64")]
         {
-            kernels.extend(Avx2::detect().map(Kernel::Avx2));
+            kernels.extend(Avx2::detect().map(|avx2| Kernel::Avx2Words(avx2.words())));
+            if avx2::is_short(queries) && avx2::is_short(base) {
+                kernels.extend(Avx2::detect().map(|avx2| Kernel::Avx2Bytes(avx2.bytes())));
+            }
             kernels.extend(Avx512::detect().map(Kernel::Avx512));
         }
         kernels
@@ -343,7 +418,7 @@ mod tests {
     fn all_kernels_agree_with_the_definition_at_every_remainder() {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         // Few distinct values make ties common; the full range tests the arithmetic's limits.
-        for top in [2u8, 255] {
+        for top in [2u8, 38, 255] {
             for (num_queries, num_base) in
                 [(1, 1), (1, 2), (5, 15), (12, 32), (13, 33), (7, 129), (25, 64), (61, 290), (3, 0), (0, 3)]
             {
@@ -351,7 +426,7 @@ mod tests {
                     (0..count * DESCRIPTOR_LEN).map(|_| rng.random_range(0..=top)).collect()
                 };
                 let (queries, base) = (random(num_queries), random(num_base));
-                for kernel in kernels() {
+                for kernel in kernels(&queries, &base) {
                     let (rows, columns) = DescriptorBlock::with_kernel(kernel, &base).search(&queries, true);
                     assert_eq!(rows, naive(&queries, &base), "{kernel:?} {num_queries} × {num_base}");
                     assert_eq!(columns, naive(&base, &queries), "{kernel:?} {num_queries} × {num_base}");
@@ -366,12 +441,59 @@ mod tests {
     fn extreme_bytes_neither_saturate_nor_overflow() {
         let queries = [vec![255; DESCRIPTOR_LEN], vec![0; DESCRIPTOR_LEN]].concat();
         let base = [vec![0; DESCRIPTOR_LEN], vec![254; DESCRIPTOR_LEN]].concat();
-        for kernel in kernels() {
+        for kernel in kernels(&queries, &base) {
             let nearest = DescriptorBlock::with_kernel(kernel, &base).two_nearest(&queries);
             let far = 128 * 255 * 255;
             assert_eq!(nearest[0], TwoNearest { index: 1, distance2: 128, second_distance2: far });
             assert_eq!(nearest[1], TwoNearest { index: 0, distance2: 0, second_distance2: 128 * 254 * 254 });
         }
+    }
+
+    #[test]
+    fn the_longest_short_descriptors_do_not_overflow() {
+        // A length of 255.996, all of it in components whose products are summed in the same 16 bits.
+        let mut long = vec![0; DESCRIPTOR_LEN];
+        for (at, value) in [(0, 127), (1, 127), (4, 127), (5, 127), (8, 31), (9, 7), (12, 2), (13, 2)] {
+            long[at] = value;
+        }
+        assert_eq!(squared_norm(&long), 65534);
+        let longer = long.iter().map(|&value| value + u8::from(value == 2)).collect::<Vec<_>>();
+        let base = [vec![0; DESCRIPTOR_LEN], long.clone(), vec![1; DESCRIPTOR_LEN]].concat();
+        for (query, num_kernels) in [(&long, 2), (&longer, 1)] {
+            let kernels = kernels(query, &base);
+            #[cfg(target_arch = "x86_64")]
+            if Avx2::detect().is_some() {
+                assert!(kernels.len() > num_kernels, "{kernels:?}");
+            }
+            for kernel in kernels {
+                let nearest = DescriptorBlock::with_kernel(kernel, &base).two_nearest(query);
+                assert_eq!(nearest, naive(query, &base), "{kernel:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn groups_are_compared_as_asked() {
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        let mut random = |count: usize| -> Vec<u8> {
+            (0..count * DESCRIPTOR_LEN).map(|_| rng.random_range(0..=50)).collect()
+        };
+        let (queries, base) = (random(50), random(80));
+        let (query_ends, base_ends) = ([20, 20, 50], [7, 80]);
+        let group = |ends: &[usize], at: usize| ends.iter().position(|&end| at < end).unwrap();
+        let compares = |query: usize, base: usize| query + base == 2;
+        let (rows, columns) = two_nearest_of_groups((&queries, &query_ends), (&base, &base_ends), compares);
+        let mut expected = (vec![TwoNearest::NONE; 50], vec![TwoNearest::NONE; 80]);
+        for (row, query) in queries.chunks_exact(DESCRIPTOR_LEN).enumerate() {
+            for (column, candidate) in base.chunks_exact(DESCRIPTOR_LEN).enumerate() {
+                if compares(group(&query_ends, row), group(&base_ends, column)) {
+                    let distance2 = squared_distance(query, candidate);
+                    expected.0[row].offer(column as u32, distance2);
+                    expected.1[column].offer(row as u32, distance2);
+                }
+            }
+        }
+        assert_eq!((rows, columns), expected);
     }
 
     #[test]

@@ -10,8 +10,8 @@ pub(super) const VECTORS: usize = 2;
 /// A value of the type proves that the processor has them. [`search`] is inlined into a function that is compiled for
 /// them, and so are these methods.
 pub(super) trait Instructions<const ROWS: usize, const LANES: usize>: Copy {
-    /// `LANES` integers of 32 bits.
-    type Vector: Copy;
+    /// What it does with sums of products.
+    type Lanes: Lanes<LANES>;
     /// Cache lines of a packed query.
     const QUERY_LINES: usize;
     /// Cache lines of `LANES` packed base descriptors.
@@ -19,8 +19,21 @@ pub(super) trait Instructions<const ROWS: usize, const LANES: usize>: Copy {
     /// Base descriptors that stay in the first-level cache while all queries pass: 16 KiB.
     const TILE: usize;
 
+    /// The processor's vectors of integers.
+    fn lanes(self) -> Self::Lanes;
     /// Products of a full tile of queries and base descriptors.
-    fn multiply(self, queries: &[Line], base: &[Line]) -> [[Self::Vector; VECTORS]; ROWS];
+    fn multiply(self, queries: &[Line], base: &[Line]) -> Products<Self::Lanes, ROWS, LANES>;
+}
+
+/// Products of a tile, `LANES` a vector.
+pub(super) type Products<L, const ROWS: usize, const LANES: usize> =
+    [[<L as Lanes<LANES>>::Vector; VECTORS]; ROWS];
+
+/// Arithmetic on vectors of `LANES` integers of 32 bits.
+pub(super) trait Lanes<const LANES: usize>: Copy {
+    /// `LANES` integers of 32 bits.
+    type Vector: Copy;
+
     /// `value` in every lane.
     fn splat(self, value: i32) -> Self::Vector;
     /// The first `LANES` values.
@@ -58,8 +71,15 @@ pub(super) fn search<K, const ROWS: usize, const LANES: usize, const COLUMNS: bo
                 let first = column / LANES * K::BASE_LINES;
                 let base_lines = &base.lines[first..first + VECTORS * K::BASE_LINES];
                 let products = kernel.multiply(query_lines, base_lines);
-                update::<K, ROWS, LANES, COLUMNS>(
-                    kernel, &products, row, column, queries, base, rows, columns,
+                update::<K::Lanes, ROWS, LANES, COLUMNS>(
+                    kernel.lanes(),
+                    &products,
+                    row,
+                    column,
+                    queries,
+                    base,
+                    rows,
+                    columns,
                 );
             }
         }
@@ -68,9 +88,9 @@ pub(super) fn search<K, const ROWS: usize, const LANES: usize, const COLUMNS: bo
 
 #[expect(clippy::too_many_arguments, reason = "the loop's own variables, inlined back into it")]
 #[inline(always)]
-fn update<K, const ROWS: usize, const LANES: usize, const COLUMNS: bool>(
-    kernel: K,
-    products: &[[K::Vector; VECTORS]; ROWS],
+fn update<L, const ROWS: usize, const LANES: usize, const COLUMNS: bool>(
+    lanes: L,
+    products: &Products<L, ROWS, LANES>,
     row: usize,
     column: usize,
     queries: &PackedQueries,
@@ -78,24 +98,24 @@ fn update<K, const ROWS: usize, const LANES: usize, const COLUMNS: bool>(
     rows: &mut Slots,
     columns: &mut Slots,
 ) where
-    K: Instructions<ROWS, LANES>,
+    L: Lanes<LANES>,
 {
     for vector in 0..VECTORS {
         let column = column + vector * LANES;
-        let column_terms = kernel.load(&base.terms[column..column + LANES]);
-        let mut column_second = kernel.load(&columns.second[column..column + LANES]);
+        let column_terms = lanes.load(&base.terms[column..column + LANES]);
+        let mut column_second = lanes.load(&columns.second[column..column + LANES]);
         for offset in 0..ROWS {
             let row = row + offset;
-            let row_term = kernel.splat(queries.terms[row]);
-            let distances = kernel.distances(products[offset][vector], column_terms, row_term);
-            let nearer_in_row = kernel.less(distances, kernel.splat(rows.second[row]));
-            let nearer_in_column = if COLUMNS { kernel.less(distances, column_second) } else { 0 };
+            let row_term = lanes.splat(queries.terms[row]);
+            let distances = lanes.distances(products[offset][vector], column_terms, row_term);
+            let nearer_in_row = lanes.less(distances, lanes.splat(rows.second[row]));
+            let nearer_in_column = if COLUMNS { lanes.less(distances, column_second) } else { 0 };
             if nearer_in_row | nearer_in_column != 0 {
-                let values = kernel.store(distances);
+                let values = lanes.store(distances);
                 update_rows(&values, nearer_in_row, row, column, rows);
                 if COLUMNS && nearer_in_column != 0 {
                     update_columns(&values, nearer_in_column, row, column, columns);
-                    column_second = kernel.load(&columns.second[column..column + LANES]);
+                    column_second = lanes.load(&columns.second[column..column + LANES]);
                 }
             }
         }

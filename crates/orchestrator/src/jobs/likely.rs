@@ -121,7 +121,8 @@ fn most_alike(
             let shared = |b: usize| {
                 let is_asked = wanted[a] || wanted[b];
                 if is_asked {
-                    stages::match_features(&matching, &images[a], &images[b]).len() as u32
+                    stages::match_features(&matching, stages::Posture::Any, &images[a], &images[b]).len()
+                        as u32
                 } else {
                     0
                 }

@@ -71,7 +71,7 @@ pub fn add_model(
     let features = add_features_of(graph, images, &params);
     let mut pairs = Vec::new();
     for &(a, b) in chosen {
-        pairs.push((a, b, add_pair(graph, images, &features, (a, b), config, seed)?));
+        pairs.push((a, b, add_pair(graph, images, &features, (a, b), config, seed)));
     }
     let cameras = share_cameras(images);
     let placed: Vec<_> =
@@ -206,20 +206,21 @@ fn add_pair(
     (a, b): (usize, usize),
     config: &Config,
     seed: u64,
-) -> Result<PairJobs> {
+) -> PairJobs {
     let name = [&images[a].name, &images[b].name];
     let name = format!("{} {}", name[0].min(name[1]), name[0].max(name[1]));
     let (a, b) = if is_swapped(images, a, b) { (b, a) } else { (a, b) };
     let matching = config.matching.clone();
+    let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
     let match_work = move |inputs: &Inputs<'_, '_>| {
         let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
-        Product::new(PairMatches(stages::match_features(&matching, &first, &second)))
+        Product::new(PairMatches(stages::match_features(&matching, posture, &first, &second)))
     };
     let matches = graph.add(Job {
         kind: "matches",
         version: stages::MATCHING_VERSION,
         name: name.clone(),
-        params: serde_json::to_value(&config.matching)?,
+        params: json!({ "matching": config.matching, "posture": posture }),
         external: BTreeMap::new(),
         memory: 8 << 20,
         work: Box::new(match_work),
@@ -249,7 +250,7 @@ fn add_pair(
         graph.require(job, "second", features[b]);
     }
     graph.require(verified, "matches", matches);
-    Ok(PairJobs { matches, verified })
+    PairJobs { matches, verified }
 }
 
 /// Cameras shared by the images that have the same one.
