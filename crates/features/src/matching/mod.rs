@@ -143,7 +143,7 @@ impl Posture {
 /// Matches come in ascending order.
 ///
 /// In level images what shows the same is turned alike, so keypoints are compared only with those turned by up to some
-/// [45°](alike) from them, but all keypoints of the ground with each other, and all of ceilings: half of the work, and
+/// 45° from them, but all keypoints of the ground with each other, and all of ceilings: half of the work, and
 /// fewer to be confused with. Where the strongest keypoints match otherwise the images are not level, and all
 /// are compared.
 ///
