@@ -242,3 +242,16 @@ fn photos_between_panoramas_that_share_little_are_placed_by_what_each_shows() {
     let (position, rotation) = (by_views.position_m.unwrap(), by_views.rotation_deg.unwrap());
     assert!(position.max < 0.1 && rotation.max < 0.5, "{position:?} {rotation:?}");
 }
+
+#[test]
+fn a_street_is_mapped_round_a_corner_as_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let params =
+        TownParams { seed: 108, panoramas: 14, panorama_step_m: 10.0, photos: 0, ..TownParams::default() };
+    write_dataset(folder.path(), &params, 90).unwrap();
+    // The last three stand in a lane, and see of the eleven before the corner what the lane's mouth leaves.
+    let scene = bench(folder.path()).scene;
+    assert_eq!((scene.registered, scene.components), (14, 1), "{scene:?}");
+    let (position, rotation) = (scene.position_m.unwrap(), scene.rotation_own_deg.unwrap());
+    assert!(position.max < 0.2 && rotation.max < 0.3, "{position:?} {rotation:?}");
+}

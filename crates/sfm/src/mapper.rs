@@ -13,6 +13,7 @@ mod lens;
 mod merge;
 mod model;
 mod nearby;
+mod neighbours;
 pub(crate) mod plane;
 mod projection;
 mod register;
@@ -50,6 +51,7 @@ use self::{
     divide::divide,
     lens::choose_lenses,
     model::Model,
+    neighbours::{neighbours, share_as_neighbours},
     projection::search_by_projection,
     register::{
         PoseHypothesis, Visibility, count_scene_matches, hypothesize, hypothesize_baseline,
@@ -70,7 +72,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 37;
+pub const MAPPER_VERSION: u32 = 38;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -1003,6 +1005,28 @@ impl<'a> Mapper<'a> {
         Some(witnesses.hear(&self.model, image, world_from_camera, inliers, self.params.max_error_sigma))
     }
 
+    /// Whether an image at a pose shares with those next to it what neighbours do, by what these share with theirs.
+    fn shares_as_neighbour(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        let model = &self.model;
+        let mut is_near = vec![false; model.poses.len()];
+        for other in model.registered_neighbours(image) {
+            is_near[other.index()] = true;
+        }
+        let placed = |of: ImageId| {
+            let pose = model.poses[of.index()].as_ref().map(|pose| pose.world_from_camera);
+            let pose = if of == image { Some(*world_from_camera) } else { pose };
+            pose.map(|pose| (pose, &model.rays[of.index()]))
+        };
+        let counts = |first: ImageId, second: ImageId| {
+            let [first_near, second_near] = [first, second].map(|image| is_near[image.index()]);
+            first_near || second_near
+        };
+        let pairs = neighbours(model.input, placed, counts, self.params.max_error_sigma);
+        let (asked, known): (Vec<_>, Vec<_>) =
+            pairs.into_iter().partition(|pair| pair.images.contains(&image));
+        share_as_neighbours(&known, &asked)
+    }
+
     /// Share of an image's verified matches to registered images that belong to pairs that agree with a pose.
     ///
     /// Resection from a few points in one corner, or on one plane, can settle on a pose far from the true one; the
@@ -1068,7 +1092,9 @@ impl<'a> Mapper<'a> {
             let judged = seen.expected >= self.params.min_visible_points;
             let is_misplaced = match self.testimony(image, &pose, &observations) {
                 Some(testimony) => testimony.speaks_against(),
-                None => judged && !self.params.is_recognized(&seen),
+                None => {
+                    judged && !self.params.is_recognized(&seen) && !self.shares_as_neighbour(image, &pose)
+                }
             };
             is_misplaced.then_some((at, seen))
         };

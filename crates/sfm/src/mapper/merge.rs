@@ -26,10 +26,11 @@ use self::{
 use super::{
     Mapper, MapperInput, MapperParams, MapperReport, Part,
     model::Model,
+    neighbours::{Neighbours, neighbours, share_as_neighbours},
     register::{Visibility, visibility, visibility_beside},
     structure::{complete_and_merge, connect},
 };
-use crate::{ImageId, PointId, Similarity, robust::RansacParams};
+use crate::{ImageId, PointId, Rigid, Similarity, robust::RansacParams};
 
 /// What became of two components that matches cross.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -361,7 +362,7 @@ impl<'a> Attempt<'_, '_, 'a> {
             let confirmed = verified(agreeing) >= params.min_confirmed_share * verified(crossings);
             confirmed && *support >= UNJUDGED_SUPPORT * params.min_registration_inliers
         };
-        if !is_recognized {
+        if !is_recognized && !self.share_as_neighbours(|image| self.pose_in_kept(image, kept_from_moved)) {
             return MergeVerdict::NotRecognized;
         }
         if self.pair_agreement(kept_from_moved) < params.min_pair_agreement {
@@ -371,6 +372,28 @@ impl<'a> Attempt<'_, '_, 'a> {
             return MergeVerdict::PositionsDisagree;
         }
         MergeVerdict::Joined
+    }
+
+    /// Whether images of the two that stand as near as neighbours, by these poses, share what neighbours within either do.
+    fn share_as_neighbours(&self, pose: impl Fn(ImageId) -> Option<Rigid> + Sync) -> bool {
+        let Sides { kept, moved } = self.sides;
+        let placed = |image: ImageId| {
+            let side = if kept.is_registered(image) { kept } else { moved };
+            pose(image).filter(|_| side.is_registered(image)).map(|pose| (pose, &side.rays[image.index()]))
+        };
+        let pairs = neighbours(kept.input, placed, |_, _| true, self.params.max_error_sigma);
+        let crosses = |pair: &Neighbours| {
+            let [first, second] = pair.images.map(|image| kept.is_registered(image));
+            first != second
+        };
+        let (asked, known): (Vec<_>, Vec<_>) = pairs.into_iter().partition(crosses);
+        share_as_neighbours(&known, &asked)
+    }
+
+    /// The pose of an image of either in the frame of the larger.
+    fn pose_in_kept(&self, image: ImageId, kept_from_moved: &Similarity) -> Option<Rigid> {
+        let of = |model: &Model<'_>| model.poses[image.index()].map(|pose| pose.world_from_camera);
+        of(self.sides.kept).or_else(|| Some(kept_from_moved.transform_pose(&of(self.sides.moved)?)))
     }
 
     /// Whether the scale rests on more than one image: on two of either component, or on points that both have.
@@ -526,11 +549,13 @@ impl<'a> Attempt<'_, '_, 'a> {
                 .sum();
             seen.expected < self.params.min_visible_points || self.params.is_recognized(&seen)
         };
+        let pose = |image: ImageId| model.poses[image.index()].map(|pose| pose.world_from_camera);
+        let recognized =
+            || recognizes(self.sides.moved, self.sides.kept) && recognizes(self.sides.kept, self.sides.moved);
         sides.into_iter().all(keeps)
             && ties >= self.params.min_registration_inliers
             && mapper.first_misplaced(&all).is_none()
-            && recognizes(self.sides.moved, self.sides.kept)
-            && recognizes(self.sides.kept, self.sides.moved)
+            && (recognized() || self.share_as_neighbours(pose))
     }
 }
 
