@@ -72,7 +72,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 38;
+pub const MAPPER_VERSION: u32 = 39;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -4,30 +4,36 @@
 //! comes from. Walls hide it, and walls so near match in no second panorama, so that no point tells that they are there.
 //! What two neighbours share is another matter: it hardly depends on where the street turns. So a model's own pairs tell
 //! how many of their matches lie on the epipolar circles of their poses, by how far apart they stand, and a pose is
-//! measured by the pairs that it brings as near together as neighbours are. A repeated façade explains a tenth of that.
+//! measured by the pairs that it brings as near together as neighbours are. A repeated façade explains a tenth of that, as it
+//! fills few directions.
 
 use rayon::prelude::*;
 use setloc_features::Rays;
 
-use super::{MapperInput, witnesses::count_on_circles};
+use super::{MapperInput, direction, witnesses::on_circles};
 use crate::{ImageId, Rigid};
 
-/// Pairs of about the same distance whose mean is what one of that distance ought to share.
-const PAIRS_AVERAGED: usize = 5;
+/// Fewest pairs of about the same distance whose mean is what one of that distance ought to share.
+const MIN_PAIRS_AVERAGED: usize = 5;
+/// The same as a share of all.
+const SHARE_AVERAGED: f64 = 0.05;
+/// Matches that count in one direction, a 96th of the sphere: a façade that repeats itself has hundreds in a few.
+const MAX_IN_CELL: usize = 5;
 /// Share of what neighbours have in common from which two images stand as near as neighbours.
 const NEAR_SHARE: f64 = 0.5;
-/// Fewest matches of neighbours that mean something: a tenth of all matches lie on the circles of any pose.
-const MIN_MATCHES: f64 = 60.0;
-/// Share of what neighbours ought to have in common that they must have. Right joins of rendered streets have 0.9 to 1.4 of
-/// it, joins in the wrong place at most 0.07.
-const MIN_SHARED: f64 = 0.7;
+/// Fewest matches of neighbours, counted so, that mean something: a few lie on the circles of any pose. Rendered streets
+/// have 96 to 260.
+const MIN_MATCHES: f64 = 40.0;
+/// Share of what neighbours ought to have in common that they must have. Of rendered streets right joins have 0.6 to 1.3 of
+/// it, joins in the wrong place up to 0.16.
+const MIN_SHARED: f64 = 0.4;
 
 /// Two panoramas that were matched with each other, at their poses.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Neighbours {
     pub images: [ImageId; 2],
     log_distance: f64,
-    /// Matches that lie on the epipolar circles.
+    /// Matches that lie on the epipolar circles, of each direction up to [`MAX_IN_CELL`].
     matches: f64,
 }
 
@@ -48,23 +54,30 @@ pub(super) fn neighbours<'r>(
             let ((first, first_rays), (second, second_rays)) = (placed(pair.first)?, placed(pair.second)?);
             let distance = (first.translation - second.translation).norm();
             let rays = [first_rays, second_rays];
-            let matches = count_on_circles(rays, &(second.inverse() * first), &pair.matches, max_error_sigma);
+            let mut cells = [0; direction::CELLS];
+            for m in on_circles(rays, &(second.inverse() * first), &pair.matches, max_error_sigma) {
+                if let Some(cell) = direction::cell(&first_rays.bearings[m.first as usize]) {
+                    cells[cell] = MAX_IN_CELL.min(cells[cell] + 1);
+                }
+            }
             (distance > 0.0).then(|| Neighbours {
                 images: [pair.first, pair.second],
                 log_distance: distance.ln(),
-                matches: matches as f64,
+                matches: cells.iter().sum::<usize>() as f64,
             })
         })
         .collect()
 }
 
 /// Whether the pairs that stand as near as neighbours share as much as neighbours do, by what those share that are known.
-///
-/// Where no pair stands so near, nothing tells.
 pub(super) fn share_as_neighbours(known: &[Neighbours], asked: &[Neighbours]) -> bool {
-    let Some(typical) = typical_matches(known).filter(|matches| *matches >= MIN_MATCHES) else {
-        return false;
-    };
+    shared(known, asked).is_some_and(|share| share >= MIN_SHARED)
+}
+
+/// What the pairs share that stand as near as neighbours, relative to what they ought to; `None` where no pair stands so
+/// near, or too little is known.
+fn shared(known: &[Neighbours], asked: &[Neighbours]) -> Option<f64> {
+    let typical = typical_matches(known).filter(|matches| *matches >= MIN_MATCHES)?;
     let (mut expected, mut found) = (0.0, 0.0);
     for pair in asked {
         let ought = matches_at(known, pair.log_distance);
@@ -73,12 +86,12 @@ pub(super) fn share_as_neighbours(known: &[Neighbours], asked: &[Neighbours]) ->
             found += pair.matches;
         }
     }
-    expected > 0.0 && found >= MIN_SHARED * expected
+    (expected > 0.0).then(|| found / expected)
 }
 
 /// What an image shares with the nearest one, in the median over the images; `None` for few pairs.
 fn typical_matches(known: &[Neighbours]) -> Option<f64> {
-    if known.len() < PAIRS_AVERAGED {
+    if known.len() < MIN_PAIRS_AVERAGED {
         return None;
     }
     let mut nearest = std::collections::BTreeMap::new();
@@ -100,7 +113,7 @@ fn matches_at(known: &[Neighbours], log_distance: f64) -> f64 {
     let mut nearest: Vec<(f64, f64)> =
         known.iter().map(|pair| ((pair.log_distance - log_distance).abs(), pair.matches)).collect();
     nearest.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
-    nearest.truncate(PAIRS_AVERAGED);
+    nearest.truncate(MIN_PAIRS_AVERAGED.max((SHARE_AVERAGED * known.len() as f64) as usize));
     nearest.iter().map(|(_, matches)| matches).sum::<f64>() / nearest.len().max(1) as f64
 }
 

@@ -16,22 +16,31 @@ const MIN_WITNESSES: usize = 2;
 /// next.
 const MIN_SPREAD_DEG: f64 = 15.0;
 
-/// How many matches lie on the epipolar circles of a pose.
-pub(super) fn count_on_circles(
-    [first, second]: [&Rays; 2],
+/// The matches that lie on the epipolar circles of a pose.
+pub(super) fn on_circles<'m>(
+    [first, second]: [&'m Rays; 2],
     second_from_first: &Rigid,
-    matches: &[Match],
+    matches: &'m [Match],
     max_error_sigma: f64,
-) -> usize {
+) -> impl Iterator<Item = &'m Match> {
     let second_from_ray = essential_from_pose(second_from_first);
     let first_from_ray = second_from_ray.transpose();
-    let agrees = |m: &&Match| {
+    matches.iter().filter(move |m| {
         let (a, b) = (m.first as usize, m.second as usize);
         let (forth, back) = (second_from_ray * first.bearings[a], first_from_ray * second.bearings[b]);
         let sigma = (forth.norm() * second.sigmas[b]).hypot(back.norm() * first.sigmas[a]);
         sigma.is_finite() && second.bearings[b].dot(&forth).abs() <= max_error_sigma * sigma
-    };
-    matches.iter().filter(agrees).count()
+    })
+}
+
+/// How many they are.
+pub(super) fn count_on_circles(
+    rays: [&Rays; 2],
+    second_from_first: &Rigid,
+    matches: &[Match],
+    max_error_sigma: f64,
+) -> usize {
+    on_circles(rays, second_from_first, matches, max_error_sigma).count()
 }
 
 /// The verified matches of images away from what repeats itself, geometry by geometry.
