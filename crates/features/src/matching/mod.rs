@@ -74,7 +74,8 @@ impl MatchParams {
     /// 1: exact two nearest neighbours, ratio and mutual test.
     /// 2: bright and dark spots apart, screened by the strongest. 3: simulated views. 4: which do not count among those
     /// that are worth screening. 5: without the last bit of descriptors; keypoints of level images that are turned alike.
-    pub const VERSION: u32 = 5;
+    /// 6: small images are taken for level by their strongest keypoints, too.
+    pub const VERSION: u32 = 6;
 
     /// Checks the ranges.
     ///
@@ -157,15 +158,10 @@ pub fn match_features(
     first: &ImageFeatures,
     second: &ImageFeatures,
 ) -> Vec<Match> {
-    let parts = |features: &ImageFeatures, most: usize| {
-        features.parts().map(|part| part.start..part.end.min(part.start.saturating_add(most)))
-    };
     let worth_screening = |features: &ImageFeatures| features.own_len() >= 4 * params.screen_features;
     let mut strongest = None;
     if params.screen_features > 0 && worth_screening(first) && worth_screening(second) {
-        let [first_parts, second_parts] =
-            [first, second].map(|features| parts(features, params.screen_features));
-        let found = match_all(params, (first, first_parts), (second, second_parts));
+        let found = match_strongest(params, params.screen_features, first, second);
         if found.len() < params.screen_matches {
             return found;
         }
@@ -190,13 +186,26 @@ fn match_own(
     if posture == Posture::Any {
         return all();
     }
-    let (sample, is_all) = strongest.map_or_else(|| (all(), true), |found| (found, false));
+    let sample = strongest.unwrap_or_else(|| match_strongest(params, alike::SAMPLE, first, second));
     if alike::contradict(&sample, first, second) {
-        return if is_all { sample } else { all() };
+        return all();
     }
     let of_parts = first.parts().into_iter().zip(second.parts());
     let alike_in = |(of_first, of_second)| alike::match_parts(params, (first, of_first), (second, of_second));
     of_parts.flat_map(alike_in).collect()
+}
+
+/// Matches so many bright and so many dark keypoints of each image, the strongest.
+fn match_strongest(
+    params: &MatchParams,
+    most: usize,
+    first: &ImageFeatures,
+    second: &ImageFeatures,
+) -> Vec<Match> {
+    let strongest = |features: &ImageFeatures| {
+        features.parts().map(|part| part.start..part.end.min(part.start.saturating_add(most)))
+    };
+    match_all(params, (first, strongest(first)), (second, strongest(second)))
 }
 
 /// Bright and dark keypoints to match.
