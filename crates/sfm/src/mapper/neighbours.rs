@@ -141,20 +141,20 @@ mod tests {
         let known = street(6, 200.0);
         // Nothing of the street is seen from there.
         assert!(share_as_neighbours(&known, &[beyond(1.0, 180.0), beyond(2.0, 0.0)]));
-        assert!(!share_as_neighbours(&known, &[beyond(1.0, 60.0), beyond(2.0, 50.0)]));
+        assert!(!share_as_neighbours(&known, &[beyond(1.0, 30.0), beyond(2.0, 50.0)]));
     }
 
     #[test]
     fn an_image_among_others_must_share_with_all_of_them() {
         let known = street(6, 200.0);
-        assert!(!share_as_neighbours(&known, &[beyond(1.0, 200.0), beyond(0.5, 20.0)]));
+        assert!(!share_as_neighbours(&known, &[beyond(1.0, 200.0), beyond(0.5, 20.0), beyond(0.7, 10.0)]));
     }
 
     #[test]
     fn far_or_few_pairs_tell_nothing() {
         assert!(!share_as_neighbours(&street(6, 200.0), &[beyond(2.0, 500.0)]));
         assert!(!share_as_neighbours(&street(3, 200.0), &[beyond(1.0, 200.0)]));
-        assert!(!share_as_neighbours(&street(6, 40.0), &[beyond(1.0, 40.0)]));
+        assert!(!share_as_neighbours(&street(6, 30.0), &[beyond(1.0, 30.0)]));
         assert!(!share_as_neighbours(&[], &[]));
     }
 }
