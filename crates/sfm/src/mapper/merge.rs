@@ -87,10 +87,19 @@ impl MergeRecord {
     pub fn sentence(&self) -> Option<String> {
         (self.verdict == MergeVerdict::Joined).then(|| {
             let [larger, smaller] = self.images;
+            let (found, expected) = (self.found_matches, self.expected_matches);
+            let shared = if is_like(found, expected) == Some(false) {
+                format!(
+                    "panoramas that stand next to each other share what neighbours do (of the {expected:.0} views of \
+                     points that there would be with nothing between, {found:.0})"
+                )
+            } else {
+                format!("they share {found:.0} of the {expected:.0} views of points that they ought to")
+            };
             format!(
                 "parts of {larger} and {smaller} images were joined: {} matches between them agree on one place, and \
-                 they share {:.0} of the {:.0} views of points that they ought to",
-                self.inliers, self.found_matches, self.expected_matches
+                 {shared}",
+                self.inliers
             )
         })
     }
@@ -353,8 +362,8 @@ impl<'a> Attempt<'_, '_, 'a> {
             return MergeVerdict::ScaleOpen;
         }
         let is_judged = |seen: &Visibility| seen.expected >= params.min_visible_points;
-        let is_recognized = if likeness.expected >= MIN_EXPECTED_MATCHES {
-            likeness.matched >= MIN_LIKENESS * likeness.expected
+        let is_recognized = if let Some(is_like) = is_like(likeness.matched, likeness.expected) {
+            is_like
         } else if seen.iter().any(is_judged) {
             seen.iter().all(|seen| !is_judged(seen) || params.is_recognized(seen))
         } else {
@@ -557,6 +566,11 @@ impl<'a> Attempt<'_, '_, 'a> {
             && mapper.first_misplaced(&all).is_none()
             && (recognized() || self.share_as_neighbours(pose))
     }
+}
+
+/// Whether so many matches of those that likeness expects are enough; `None` where it expects too few to judge by.
+fn is_like(matched: f64, expected: f64) -> Option<bool> {
+    (expected >= MIN_EXPECTED_MATCHES).then_some(matched >= MIN_LIKENESS * expected)
 }
 
 fn median(mut values: Vec<f64>) -> Option<f64> {
