@@ -1005,22 +1005,18 @@ impl<'a> Mapper<'a> {
         Some(witnesses.hear(&self.model, image, world_from_camera, inliers, self.params.max_error_sigma))
     }
 
-    /// Whether an image at a pose shares with those next to it what neighbours do, by what these share with theirs.
-    fn shares_as_neighbour(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+    /// Whether an image shares with those next to it what neighbours do, by what these share with theirs.
+    fn shares_as_neighbour(&self, image: ImageId) -> bool {
         let model = &self.model;
         let mut is_near = vec![false; model.poses.len()];
         for other in model.registered_neighbours(image) {
             is_near[other.index()] = true;
         }
         let placed = |of: ImageId| {
-            let pose = model.poses[of.index()].as_ref().map(|pose| pose.world_from_camera);
-            let pose = if of == image { Some(*world_from_camera) } else { pose };
-            pose.map(|pose| (pose, &model.rays[of.index()]))
+            let pose = model.poses[of.index()].as_ref()?.world_from_camera;
+            Some((pose, &model.rays[of.index()]))
         };
-        let counts = |first: ImageId, second: ImageId| {
-            let [first_near, second_near] = [first, second].map(|image| is_near[image.index()]);
-            first_near || second_near
-        };
+        let counts = |first: ImageId, second: ImageId| is_near[first.index()] || is_near[second.index()];
         let pairs = neighbours(model.input, placed, counts, self.params.max_error_sigma);
         let (asked, known): (Vec<_>, Vec<_>) =
             pairs.into_iter().partition(|pair| pair.images.contains(&image));
@@ -1092,9 +1088,7 @@ impl<'a> Mapper<'a> {
             let judged = seen.expected >= self.params.min_visible_points;
             let is_misplaced = match self.testimony(image, &pose, &observations) {
                 Some(testimony) => testimony.speaks_against(),
-                None => {
-                    judged && !self.params.is_recognized(&seen) && !self.shares_as_neighbour(image, &pose)
-                }
+                None => judged && !self.params.is_recognized(&seen) && !self.shares_as_neighbour(image),
             };
             is_misplaced.then_some((at, seen))
         };

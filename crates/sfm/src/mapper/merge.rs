@@ -573,7 +573,8 @@ fn is_like(matched: f64, expected: f64) -> Option<bool> {
     (expected >= MIN_EXPECTED_MATCHES).then_some(matched >= MIN_LIKENESS * expected)
 }
 
-fn median(mut values: Vec<f64>) -> Option<f64> {
+/// The upper middle of the finite values.
+pub(super) fn median(mut values: Vec<f64>) -> Option<f64> {
     values.retain(|value| value.is_finite());
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied()

@@ -7,10 +7,12 @@
 //! measured by the pairs that it brings as near together as neighbours are. A repeated façade explains a tenth of that, as it
 //! fills few directions.
 
+use std::collections::BTreeMap;
+
 use rayon::prelude::*;
 use setloc_features::Rays;
 
-use super::{MapperInput, direction, witnesses::on_circles};
+use super::{MapperInput, direction, merge::median, witnesses::on_circles};
 use crate::{ImageId, Rigid};
 
 /// Fewest pairs of about the same distance whose mean is what one of that distance ought to share.
@@ -94,7 +96,7 @@ fn typical_matches(known: &[Neighbours]) -> Option<f64> {
     if known.len() < MIN_PAIRS_AVERAGED {
         return None;
     }
-    let mut nearest = std::collections::BTreeMap::new();
+    let mut nearest = BTreeMap::new();
     for pair in known {
         for image in pair.images {
             let best: &mut &Neighbours = nearest.entry(image).or_insert(pair);
@@ -103,9 +105,7 @@ fn typical_matches(known: &[Neighbours]) -> Option<f64> {
             }
         }
     }
-    let mut matches: Vec<f64> = nearest.values().map(|pair| pair.matches).collect();
-    matches.sort_by(f64::total_cmp);
-    matches.get(matches.len() / 2).copied()
+    median(nearest.values().map(|pair| pair.matches).collect())
 }
 
 /// What the known pairs of about this distance share in the mean.
