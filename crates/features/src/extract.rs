@@ -48,8 +48,8 @@ impl FeatureParams {
     ///
     /// 1: OpenCV SIFT, RootSIFT u8, half-pixel corrected, seam padded, spread over the sphere.
     /// 2: own SIFT, bright and dark spots apart. 3: simulated views. 4: large simulated views without their finest points.
-    /// 5: weaker keypoints where there are few.
-    pub const VERSION: u32 = 5;
+    /// 5: weaker keypoints where there are few. 6: keypoints end at most five pixels from where they begin to be sought.
+    pub const VERSION: u32 = 6;
 
     /// Checks the ranges.
     ///

@@ -1,5 +1,7 @@
-use super::orientation::gradient_row;
-use super::plane::Plane;
+use std::ops::RangeInclusive;
+
+use super::orientation::gradients_of_block;
+use super::plane::{LANES, Plane};
 use super::vectorized::{Level, vectorized};
 use crate::DESCRIPTOR_LEN;
 
@@ -13,6 +15,8 @@ const CELL_SIGMAS: f32 = 3.0;
 const CLIP: f32 = 0.2;
 /// Cells along each side with those that catch what lies half outside.
 const PADDED: usize = CELLS + 2;
+/// From the first of the four cells that share a pixel to each of them.
+const NEIGHBOURS: [usize; 4] = [0, 1, PADDED, PADDED + 1];
 
 /// Where and how to describe, in pixels of the octave.
 #[derive(Debug, Clone, Copy)]
@@ -27,9 +31,46 @@ pub(super) struct Frame {
 /// Buffers of [`describe`].
 #[derive(Debug, Default)]
 pub(super) struct DescriptorRows {
-    magnitudes: Vec<f32>,
-    directions: Vec<f32>,
-    column_weights: Vec<f32>,
+    column_weights: Vec<[f32; LANES]>,
+    spots: Vec<Spots>,
+}
+
+/// Where pixels of a row lie in the histogram.
+#[derive(Debug, Default, Clone, Copy)]
+struct Spots {
+    /// The first of the four cells that share a pixel.
+    cells: [f32; LANES],
+    /// How far the pixel lies towards the next cell to the right and downwards, as a share of a cell.
+    across: [f32; LANES],
+    down: [f32; LANES],
+    directions: [f32; LANES],
+    weights: [f32; LANES],
+}
+
+/// Half the side of the square of cells and of the half cells round it that still count.
+const HALF: f32 = (CELLS + 1) as f32 / 2.0;
+
+impl Frame {
+    /// Columns and rows of the pixels that are looked at; `None` where there are none.
+    fn pixels(&self, plane: &Plane) -> Option<[RangeInclusive<usize>; 2]> {
+        let (sine, cosine) = self.orientation.sin_cos();
+        let reach = CELL_SIGMAS * self.sigma * HALF * (sine.abs() + cosine.abs());
+        let within = |at: f32, len: usize| {
+            let first = (at - reach).ceil().max(1.0) as usize;
+            let last = ((at + reach).floor() as isize).min(len as isize - 2);
+            (last >= first as isize).then_some(first..=last as usize)
+        };
+        Some([within(self.x, plane.width)?, within(self.y, plane.height)?])
+    }
+}
+
+/// Asks for the pixels that [`describe`] will read, which are seldom in a cache otherwise.
+pub(super) fn prefetch(plane: &Plane, frame: &Frame) {
+    if let Some([columns, rows]) = frame.pixels(plane) {
+        for y in rows {
+            plane.prefetch(y, *columns.start()..*columns.end() + 1);
+        }
+    }
 }
 
 /// The histogram of gradient directions in 4 × 4 cells about a point, clipped; not normalized.
@@ -60,54 +101,68 @@ vectorized! {
         histogram: &mut [[f32; BINS]; PADDED * PADDED],
     ) {
         let cell = CELL_SIGMAS * frame.sigma;
-        // Half the side of the square of cells and of the half cells round it that still count.
-        let half = (CELLS + 1) as f32 / 2.0;
+        let Some([columns, lines]) = frame.pixels(plane) else {
+            return;
+        };
+        let (left, right) = columns.into_inner();
         let (sine, cosine) = frame.orientation.sin_cos();
-        let reach = cell * half * (sine.abs() + cosine.abs());
         let (per_x, per_y) = (cosine / cell, sine / cell);
         let turned = frame.orientation * (BINS as f32 / std::f32::consts::TAU);
         // The window's deviation is half the square of cells.
         let falloff = -2.0 / ((CELLS * CELLS) as f32 * cell * cell);
-        let first = |at: f32| (at - reach).ceil().max(1.0) as usize;
-        let last = |at: f32, len: usize| ((at + reach).floor() as isize).min(len as isize - 2);
-        let (left, right) = (first(frame.x), last(frame.x, plane.width));
-        let (top, bottom) = (first(frame.y), last(frame.y, plane.height));
-        if right < left as isize || bottom < top as isize {
-            return;
-        }
+        // Blocks begin at the first column of each row, so weights are laid out for one more.
+        let blocks = (right + 1 - left).div_ceil(LANES) + 1;
         rows.column_weights.clear();
-        rows.column_weights.extend((left..=right as usize).map(|x| {
-            let dx = x as f32 - frame.x;
-            (dx * dx * falloff).exp()
+        rows.column_weights.extend((0..blocks).map(|block| {
+            std::array::from_fn(|lane| {
+                let dx = (left + block * LANES + lane) as f32 - frame.x;
+                (dx * dx * falloff).exp()
+            })
         }));
-        rows.magnitudes.resize(rows.column_weights.len(), 0.0);
-        rows.directions.resize(rows.column_weights.len(), 0.0);
-        for y in top..=bottom as usize {
+        rows.spots.resize(blocks, Spots::default());
+        for y in lines {
             let dy = y as f32 - frame.y;
             // The columns where both |u| and |v| are below half, with u = dx·per_x + dy·per_y, v = dy·per_x − dx·per_y.
-            let (a_low, a_high) = columns_within(per_x, dy * per_y, half);
-            let (b_low, b_high) = columns_within(-per_y, dy * per_x, half);
+            let (a_low, a_high) = columns_within(per_x, dy * per_y, HALF);
+            let (b_low, b_high) = columns_within(-per_y, dy * per_x, HALF);
             let begin = ((frame.x + a_low.max(b_low)).ceil().max(left as f32)) as usize;
             let end = (frame.x + a_high.min(b_high)).floor().min(right as f32);
             if end < begin as f32 {
                 continue;
             }
             let len = end as usize - begin + 1;
-            let (magnitudes, directions) = (&mut rows.magnitudes[..len], &mut rows.directions[..len]);
-            gradient_row(plane, y, begin, BINS as f32, magnitudes, directions);
             let row_weight = (dy * dy * falloff).exp();
-            let weights = &rows.column_weights[begin - left..][..len];
+            for (block, spots) in rows.spots[..len.div_ceil(LANES)].iter_mut().enumerate() {
+                let first = begin + block * LANES;
+                let weights = &rows.column_weights.as_flattened()[first - left..][..LANES];
+                let (magnitudes, directions) = gradients_of_block(plane, y, first, BINS as f32);
+                for lane in 0..LANES {
+                    let dx = (first + lane) as f32 - frame.x;
+                    let column = dx * per_x + dy * per_y + HALF;
+                    let row = dy * per_x - dx * per_y + HALF;
+                    // Rounding may put a border pixel a hair outside.
+                    let (column, row) = (column.clamp(0.0, 4.9999), row.clamp(0.0, 4.9999));
+                    let (cell_column, cell_row) = (whole_cells(column), whole_cells(row));
+                    spots.cells[lane] = cell_row * PADDED as f32 + cell_column;
+                    (spots.across[lane], spots.down[lane]) = (column - cell_column, row - cell_row);
+                    spots.weights[lane] = row_weight * weights[lane] * magnitudes[lane];
+                    let direction = turned - directions[lane];
+                    spots.directions[lane] = if direction < 0.0 { direction + BINS as f32 } else { direction };
+                }
+            }
+            // Neighbours mostly share the same four cells: these are summed in registers as long as they do.
+            let mut cell = rows.spots[0].cells[0];
+            let mut sums = NEIGHBOURS.map(|offset| histogram[cell as usize + offset]);
             for at in 0..len {
-                let dx = (begin + at) as f32 - frame.x;
-                let column = dx * per_x + dy * per_y + half;
-                let row = dy * per_x - dx * per_y + half;
-                // Rounding may put a border pixel a hair outside.
-                let (column, row) = (column.clamp(0.0, 4.9999), row.clamp(0.0, 4.9999));
-                let (cell_column, cell_row) = (column as usize, row as usize);
-                let (column, row) = (column - cell_column as f32, row - cell_row as f32);
-                let mut direction = turned - directions[at];
-                direction = if direction < 0.0 { direction + BINS as f32 } else { direction };
-                let weight = row_weight * weights[at] * magnitudes[at];
+                let (spots, lane) = (&rows.spots[at / LANES], at % LANES);
+                if spots.cells[lane] != cell {
+                    for (offset, sums) in NEIGHBOURS.into_iter().zip(sums) {
+                        histogram[cell as usize + offset] = sums;
+                    }
+                    cell = spots.cells[lane];
+                    sums = NEIGHBOURS.map(|offset| histogram[cell as usize + offset]);
+                }
+                let (direction, weight) = (spots.directions[lane], spots.weights[lane]);
                 let mut spread = [0.0f32; BINS];
                 for bin in 0..BINS {
                     let apart = (direction - bin as f32).abs();
@@ -115,22 +170,29 @@ vectorized! {
                     let near = 1.0 - apart;
                     spread[bin] = if near > 0.0 { near * weight } else { 0.0 };
                 }
-                let base = cell_row * PADDED + cell_column;
-                let shares = [
-                    (0, (1.0 - row) * (1.0 - column)),
-                    (1, (1.0 - row) * column),
-                    (PADDED, row * (1.0 - column)),
-                    (PADDED + 1, row * column),
-                ];
-                for (offset, share) in shares {
-                    let target = &mut histogram[base + offset];
+                let (column, row) = (spots.across[lane], spots.down[lane]);
+                let shares =
+                    [(1.0 - row) * (1.0 - column), (1.0 - row) * column, row * (1.0 - column), row * column];
+                for (sums, share) in sums.iter_mut().zip(shares) {
                     for bin in 0..BINS {
-                        target[bin] += spread[bin] * share;
+                        sums[bin] += spread[bin] * share;
                     }
                 }
             }
+            for (offset, sums) in NEIGHBOURS.into_iter().zip(sums) {
+                histogram[cell as usize + offset] = sums;
+            }
         }
     }
+}
+
+/// The whole number below a number of [0, 5), or itself or the one below a whole number. Compilers leave conversions to integers,
+/// which have to bear any number, one by one.
+#[inline(always)]
+fn whole_cells(cells: f32) -> f32 {
+    // In floats of this size the last bit is worth 1.
+    const ROUNDING: f32 = 12_582_912.0;
+    (cells - 0.5) + ROUNDING - ROUNDING
 }
 
 /// The `x` for which |x·slope + offset| < half.

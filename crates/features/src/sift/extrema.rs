@@ -6,8 +6,12 @@ use super::{GREY_RANGE, SiftParams};
 
 /// Pixels along the border without keypoints.
 const BORDER: usize = 5;
-/// Most moves of the interpolation to a neighbouring pixel.
+/// Most moves of the interpolation to another pixel.
 const MAX_MOVES: usize = 5;
+/// Pixels that the interpolation may end from where it began.
+const MAX_WAY: usize = 5;
+/// Rows above and below that are read about a row that is scanned.
+pub(super) const REACH: usize = MAX_WAY + 1;
 /// Flags that are looked at together.
 const CHUNK: usize = 32;
 
@@ -28,9 +32,11 @@ pub(super) struct Extremum {
     pub contrast: f32,
 }
 
-/// Rows of the differences and of their extremes over 3 × 3 pixels.
+/// Where a scan has come to, with rows of the differences and of their extremes over 3 × 3 pixels.
 #[derive(Debug, Default)]
-pub(super) struct ScanRows {
+pub(super) struct Scan {
+    /// The row to be scanned next.
+    row: usize,
     /// Three successive rows of each difference, row `y` in slot `y % 3`.
     differences: Vec<[Vec<f32>; 3]>,
     largest: Vec<Vec<f32>>,
@@ -39,61 +45,73 @@ pub(super) struct ScanRows {
     flags: Vec<u8>,
 }
 
-/// Finds and refines the extrema of one octave from its blurred layers.
-///
-/// D. G. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004, sections 3.1 and 4.
-pub(super) fn find_extrema(
-    level: Level,
-    params: &SiftParams,
-    layers: &[&Plane],
-    rows: &mut ScanRows,
-    found: &mut Vec<Extremum>,
-) {
-    let (width, height) = (layers[0].width, layers[0].height);
-    if width.min(height) <= 2 * BORDER {
-        return;
-    }
-    let num_differences = layers.len() - 1;
-    rows.differences.resize_with(num_differences, Default::default);
-    for row in rows.differences.iter_mut().flatten() {
-        row.resize(width, 0.0);
-    }
-    for target in [&mut rows.largest, &mut rows.smallest] {
-        target.resize_with(num_differences, Vec::new);
-        for row in target.iter_mut() {
+impl Scan {
+    /// Begins anew, for an octave of this width with so many blurred layers.
+    pub fn begin(&mut self, width: usize, layers: usize) {
+        self.row = BORDER;
+        let num_differences = layers - 1;
+        self.differences.resize_with(num_differences, Default::default);
+        for row in self.differences.iter_mut().flatten() {
             row.resize(width, 0.0);
         }
+        for target in [&mut self.largest, &mut self.smallest] {
+            target.resize_with(num_differences, Vec::new);
+            for row in target.iter_mut() {
+                row.resize(width, 0.0);
+            }
+        }
+        self.column.resize(width, 0.0);
+        self.flags.resize(width, 0);
     }
-    rows.column.resize(width, 0.0);
-    rows.flags.resize(width, 0);
-    // Half the contrast asked for, since interpolation raises it.
-    let threshold = (0.5 * params.contrast_threshold / params.octave_layers as f64) as f32 * GREY_RANGE;
-    for y in BORDER - 1..=BORDER {
-        subtract_row(level, layers, y, rows);
-    }
-    for y in BORDER..height - BORDER {
-        subtract_row(level, layers, y + 1, rows);
-        extremes_of_row(level, rows);
-        for layer in 1..num_differences - 1 {
-            flag_extrema(level, rows, layer, y % 3, threshold);
-            for (chunk, flags) in rows.flags.chunks(CHUNK).enumerate() {
-                if flags.iter().fold(0, |any, flag| any | flag) == 0 {
-                    continue;
-                }
-                for (lane, _) in flags.iter().enumerate().filter(|(_, flag)| **flag != 0) {
-                    let x = chunk * CHUNK + lane;
-                    if (BORDER..width - BORDER).contains(&x) {
-                        found.extend(refine(params, layers, layer, x, y));
+
+    /// Finds and refines the extrema of one octave in the rows that the first `written` ones of its blurred layers allow.
+    ///
+    /// D. G. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004, sections 3.1 and 4.
+    pub fn advance(
+        &mut self,
+        level: Level,
+        params: &SiftParams,
+        layers: &[Plane],
+        written: usize,
+        found: &mut Vec<Extremum>,
+    ) {
+        let (width, height) = (layers[0].width, layers[0].height);
+        if width.min(height) <= 2 * BORDER {
+            return;
+        }
+        let ready = if written == height { height - BORDER } else { written.saturating_sub(REACH) };
+        // Half the contrast asked for, since interpolation raises it.
+        let threshold = (0.5 * params.contrast_threshold / params.octave_layers as f64) as f32 * GREY_RANGE;
+        if self.row == BORDER && self.row < ready {
+            for y in BORDER - 1..=BORDER {
+                subtract_row(level, layers, y, self);
+            }
+        }
+        for y in self.row..ready {
+            subtract_row(level, layers, y + 1, self);
+            extremes_of_row(level, self);
+            for layer in 1..self.differences.len() - 1 {
+                flag_extrema(level, self, layer, y % 3, threshold);
+                for (chunk, flags) in self.flags.chunks(CHUNK).enumerate() {
+                    if flags.iter().fold(0, |any, flag| any | flag) == 0 {
+                        continue;
+                    }
+                    for (lane, _) in flags.iter().enumerate().filter(|(_, flag)| **flag != 0) {
+                        let x = chunk * CHUNK + lane;
+                        if (BORDER..width - BORDER).contains(&x) {
+                            found.extend(refine(params, layers, layer, x, y));
+                        }
                     }
                 }
             }
         }
+        self.row = self.row.max(ready);
     }
 }
 
 vectorized! {
     /// Puts row `y` of all differences into its slot.
-    fn subtract_row(layers: &[&Plane], y: usize, rows: &mut ScanRows) {
+    fn subtract_row(layers: &[Plane], y: usize, rows: &mut Scan) {
         for (index, slots) in rows.differences.iter_mut().enumerate() {
             let (finer, coarser) = (layers[index].row(y), layers[index + 1].row(y));
             for ((target, &finer), &coarser) in slots[y % 3].iter_mut().zip(finer).zip(coarser) {
@@ -105,7 +123,7 @@ vectorized! {
 
 vectorized! {
     /// The largest and the smallest of 3 × 3 pixels of each difference.
-    fn extremes_of_row(rows: &mut ScanRows) {
+    fn extremes_of_row(rows: &mut Scan) {
         let width = rows.flags.len();
         for (index, [a, b, c]) in rows.differences.iter().enumerate() {
             let column = &mut rows.column[..width];
@@ -130,7 +148,7 @@ vectorized! {
 
 vectorized! {
     /// Marks the pixels that no neighbour in place and scale exceeds.
-    fn flag_extrema(rows: &mut ScanRows, layer: usize, slot: usize, threshold: f32) {
+    fn flag_extrema(rows: &mut Scan, layer: usize, slot: usize, threshold: f32) {
         let width = rows.flags.len();
         let values = &rows.differences[layer][slot][..width];
         let [l0, l1, l2] = [layer - 1, layer, layer + 1].map(|at| &rows.largest[at][..width]);
@@ -159,8 +177,14 @@ fn smaller(a: f32, b: f32) -> f32 {
 
 /// Fits a quadratic to the 3 × 3 × 3 neighbours and moves to its extremum; `None` for what moves out, lacks contrast
 /// or lies on an edge.
-fn refine(params: &SiftParams, layers: &[&Plane], layer: usize, x: usize, y: usize) -> Option<Extremum> {
-    let (mut layer, mut x, mut y) = (layer, x, y);
+fn refine(
+    params: &SiftParams,
+    layers: &[Plane],
+    layer: usize,
+    begin_x: usize,
+    begin_y: usize,
+) -> Option<Extremum> {
+    let (mut layer, mut x, mut y) = (layer, begin_x, begin_y);
     let (width, height) = (layers[0].width, layers[0].height);
     for _ in 0..MAX_MOVES {
         let value = |dx: isize, dy: isize, ds: isize| {
@@ -215,6 +239,7 @@ fn refine(params: &SiftParams, layers: &[&Plane], layer: usize, x: usize, y: usi
         if !within(new_layer, 1, params.octave_layers + 1)
             || !within(new_x, BORDER, width - BORDER)
             || !within(new_y, BORDER, height - BORDER)
+            || new_x.abs_diff(begin_x as isize).max(new_y.abs_diff(begin_y as isize)) > MAX_WAY
         {
             return None;
         }

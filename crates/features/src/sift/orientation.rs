@@ -1,5 +1,5 @@
 use super::Extremum;
-use super::plane::Plane;
+use super::plane::{LANES, Plane};
 use super::vectorized::{Level, vectorized};
 
 /// Directions of the histogram.
@@ -13,8 +13,8 @@ const PEAK_SHARE: f32 = 0.8;
 #[derive(Debug, Default)]
 pub(super) struct OrientationRows {
     weights: Vec<f32>,
-    magnitudes: Vec<f32>,
-    bins: Vec<f32>,
+    magnitudes: Vec<[f32; LANES]>,
+    bins: Vec<[f32; LANES]>,
 }
 
 /// The main directions of the gradients about a point, in radians clockwise from image right.
@@ -36,13 +36,14 @@ pub(super) fn orientations(
     let right = (extremum.column + radius).min(plane.width - 2);
     let top = extremum.row.saturating_sub(radius).max(1);
     let bottom = (extremum.row + radius).min(plane.height - 2);
-    rows.magnitudes.resize(2 * radius + 1, 0.0);
-    rows.bins.resize(2 * radius + 1, 0.0);
+    let len = right + 1 - left;
+    rows.magnitudes.resize(len.div_ceil(LANES), [0.0; LANES]);
+    rows.bins.resize(len.div_ceil(LANES), [0.0; LANES]);
     for y in top..=bottom {
-        let (magnitudes, bins) = (&mut rows.magnitudes[..=right - left], &mut rows.bins[..=right - left]);
-        gradients(level, plane, y, left, BINS as f32, magnitudes, bins);
+        gradients(level, plane, y, left, &mut rows.magnitudes, &mut rows.bins);
+        let (magnitudes, bins) = (rows.magnitudes.as_flattened(), rows.bins.as_flattened());
         let row_weight = rows.weights[y.abs_diff(extremum.row)];
-        for (at, (&magnitude, &bin)) in magnitudes.iter().zip(&*bins).enumerate() {
+        for (at, (&magnitude, &bin)) in magnitudes[..len].iter().zip(bins).enumerate() {
             let weight = row_weight * rows.weights[(left + at).abs_diff(extremum.column)];
             // A bin's centre lies at its number.
             let bin = (bin + 0.5) as usize;
@@ -64,31 +65,34 @@ pub(super) fn orientations(
 }
 
 vectorized! {
-    fn gradients(plane: &Plane, y: usize, left: usize, turn: f32, magnitudes: &mut [f32], directions: &mut [f32]) {
-        gradient_row(plane, y, left, turn, magnitudes, directions);
+    fn gradients(plane: &Plane, y: usize, left: usize, magnitudes: &mut [[f32; LANES]], bins: &mut [[f32; LANES]]) {
+        for (block, (magnitudes, bins)) in magnitudes.iter_mut().zip(bins).enumerate() {
+            (*magnitudes, *bins) = gradients_of_block(plane, y, left + block * LANES, BINS as f32);
+        }
     }
 }
 
-/// Magnitudes of the gradients of a row from column `left` on, and their directions, clockwise from image right, in
-/// `turn`ths of a turn within [0, turn].
+/// Magnitudes of the gradients of [`LANES`] pixels from column `left` on, and their directions, clockwise from image right, in
+/// `turn`ths of a turn within [0, turn]. Beyond the row's end, any numbers.
 #[inline(always)]
-pub(super) fn gradient_row(
+pub(super) fn gradients_of_block(
     plane: &Plane,
     y: usize,
     left: usize,
     turn: f32,
-    magnitudes: &mut [f32],
-    directions: &mut [f32],
-) {
-    let len = magnitudes.len();
-    let row = &plane.row(y)[left - 1..=left + len];
-    let (above, below) = (&plane.row(y - 1)[left..left + len], &plane.row(y + 1)[left..left + len]);
-    let directions = &mut directions[..len];
-    for x in 0..len {
-        let (dx, dy) = (row[x + 2] - row[x], below[x] - above[x]);
-        magnitudes[x] = (dx * dx + dy * dy).sqrt();
-        directions[x] = turns(dx, dy) * turn;
+) -> ([f32; LANES], [f32; LANES]) {
+    let at = |y: usize, x: usize| -> &[f32; LANES] {
+        plane.padded_row(y)[x..x + LANES].try_into().expect("a slice of this length")
+    };
+    let (before, after) = (at(y, left - 1), at(y, left + 1));
+    let (above, below) = (at(y - 1, left), at(y + 1, left));
+    let (mut magnitudes, mut directions) = ([0.0; LANES], [0.0; LANES]);
+    for lane in 0..LANES {
+        let (dx, dy) = (after[lane] - before[lane], below[lane] - above[lane]);
+        magnitudes[lane] = (dx * dx + dy * dy).sqrt();
+        directions[lane] = turns(dx, dy) * turn;
     }
+    (magnitudes, directions)
 }
 
 /// The angle of (x, y) in turns within [0, 1], to 2e-6: M. Abramowitz, I. A. Stegun, "Handbook of Mathematical
@@ -97,7 +101,9 @@ pub(super) fn gradient_row(
 fn turns(x: f32, y: f32) -> f32 {
     let (across, along) = (y.abs(), x.abs());
     let steep = across > along;
-    let (small, large) = if steep { (along, across) } else { (across, along) };
+    // Chosen one by one: a choice of the pair makes compilers do everything twice.
+    let small = if steep { along } else { across };
+    let large = if steep { across } else { along };
     let ratio = small / (large + f32::MIN_POSITIVE);
     let square = ratio * ratio;
     let angle = ratio
