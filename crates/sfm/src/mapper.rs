@@ -72,7 +72,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 39;
+pub const MAPPER_VERSION: u32 = 40;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -439,13 +439,9 @@ fn grow_again(
     seed: u64,
 ) -> Vec<Part> {
     for at in 0..parts.len() {
-        let mut taken = vec![false; input.images.len()];
-        let others = parts[..at].iter().chain(&parts[at + 1..]);
-        for image in others.flat_map(|part| part.component.registered()) {
-            taken[image.index()] = true;
-        }
+        let taken = merge::taken_by_others(input, &parts, &[at]);
         let part = &parts[at];
-        let mut mapper = Mapper::over(params, Model::open(input, &part.component), taken, seed);
+        let mut mapper = Mapper::over(params, Model::open(input, &part.component, &taken), taken, seed);
         mapper.anchors.clone_from(&part.anchors);
         mapper.witnesses = Some(witnesses);
         mapper.refine(2, 20);
@@ -596,7 +592,7 @@ impl<'a> Mapper<'a> {
         seed: u64,
     ) -> Option<Self> {
         let has_work = enabled_pairs(input, &taken).contains(&true);
-        has_work.then(|| Self::over(params, Model::new(input), taken, seed))
+        has_work.then(|| Self::over(params, Model::without(input, &taken), taken, seed))
     }
 
     /// Works on a model from images that are not taken.
@@ -1129,13 +1125,7 @@ impl<'a> Mapper<'a> {
             self.refine(4, 20);
             self.grow();
         }
-        // Whoever is taken out may find its right place in the finished surroundings.
-        for _ in 0..3 {
-            if self.expel_misplaced() == 0 {
-                break;
-            }
-            self.grow();
-        }
+        self.replace_misplaced();
         for image in self.model.registered().collect::<Vec<_>>() {
             settle_pose(&mut self.model, &self.graph, self.params, image, self.seed);
         }
@@ -1147,6 +1137,16 @@ impl<'a> Mapper<'a> {
         self.refine(4, 20);
         self.adjust_all(30);
         self.filter_all(self.params.limits());
+    }
+
+    /// Takes out whoever is misplaced, who may find its right place in the finished surroundings.
+    fn replace_misplaced(&mut self) {
+        for _ in 0..3 {
+            if self.expel_misplaced() == 0 {
+                break;
+            }
+            self.grow();
+        }
     }
 
     /// Seeks further observations of points, a second time with the better poses; whether there were any.

@@ -12,7 +12,10 @@ mod crossing;
 mod likeness;
 mod similarity;
 
-use std::collections::BTreeSet;
+use std::{
+    cell::OnceCell,
+    collections::{BTreeMap, BTreeSet},
+};
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -107,6 +110,10 @@ impl MergeRecord {
 
 /// Fewest matches of a similarity that more are sought for.
 const MIN_SEED: usize = 6;
+/// Pairs of images about which similarities are sought where all matches together give none, and images of either
+/// component about each of a pair.
+const LOCAL_PAIRS: usize = 5;
+const LOCAL_IMAGES: usize = 3;
 /// Half widths of the bands about the epipolar circles in which they are sought, one after the other.
 const GUIDED_BANDS_RAD: [f64; 3] = [0.02, 0.008, 0.004];
 /// Matches of an image that make it count for the scale between two components: one more than its pose needs.
@@ -129,6 +136,8 @@ const MAX_POSITION_ERROR_SHARE: f64 = 0.3;
 const MIN_KEPT_OBSERVATIONS: f64 = 0.9;
 
 /// Joins components, largest first, as long as a similarity between two of them is supported. Returns them by size.
+///
+/// A whole is finished when nothing more joins it: that takes far longer than all else about a join.
 pub(super) fn join_supported(
     params: &MapperParams,
     input: &MapperInput<'_>,
@@ -137,15 +146,41 @@ pub(super) fn join_supported(
     seed: u64,
 ) -> Vec<Part> {
     let mut tried = BTreeSet::new();
+    let mut joined_images = BTreeSet::new();
     loop {
         parts.sort_by_key(|part| std::cmp::Reverse(part.size()));
         let Some((kept, moved, joined)) = first_joined(params, input, &parts, &mut tried, report, seed)
         else {
-            return parts;
+            break;
         };
+        joined_images.extend(joined.component.registered());
         parts[kept] = joined;
         parts.remove(moved);
     }
+    for at in 0..parts.len() {
+        if parts[at].component.registered().any(|image| joined_images.contains(&image)) {
+            let taken = taken_by_others(input, &parts, &[at]);
+            let part = &parts[at];
+            let mut mapper = Mapper::over(params, Model::open(input, &part.component, &taken), taken, seed);
+            mapper.anchors.clone_from(&part.anchors);
+            mapper.finish();
+            report.registrations.append(&mut mapper.records);
+            parts[at] = mapper.into_part();
+        }
+    }
+    parts.sort_by_key(|part| std::cmp::Reverse(part.size()));
+    parts
+}
+
+/// The images of all parts but these.
+pub(super) fn taken_by_others(input: &MapperInput<'_>, parts: &[Part], but: &[usize]) -> Vec<bool> {
+    let mut taken = vec![false; input.images.len()];
+    for (_, other) in parts.iter().enumerate().filter(|(at, _)| !but.contains(at)) {
+        for image in other.component.registered() {
+            taken[image.index()] = true;
+        }
+    }
+    taken
 }
 
 /// What tells a part from all others and from itself before it grew: its first image and its size.
@@ -159,21 +194,15 @@ fn first_joined(
     report: &mut MapperReport,
     seed: u64,
 ) -> Option<(usize, usize, Part)> {
+    let models: Vec<OnceCell<Model<'_>>> = parts.iter().map(|_| OnceCell::new()).collect();
+    let model = |at: usize| models[at].get_or_init(|| Model::of_component(input, &parts[at].component));
     for (kept, larger) in parts.iter().enumerate() {
         for (moved, smaller) in parts.iter().enumerate().skip(kept + 1) {
             if !tried.insert([larger.state(), smaller.state()]) {
                 continue;
             }
-            let mut taken = vec![false; input.images.len()];
-            for (_, other) in parts.iter().enumerate().filter(|(at, _)| *at != kept && *at != moved) {
-                for image in other.component.registered() {
-                    taken[image.index()] = true;
-                }
-            }
-            let sides = Sides {
-                kept: &Model::of_component(input, &larger.component),
-                moved: &Model::of_component(input, &smaller.component),
-            };
+            let taken = taken_by_others(input, parts, &[kept, moved]);
+            let sides = Sides { kept: model(kept), moved: model(moved) };
             let attempt = Attempt { params, kept: larger, moved: smaller, sides, seed };
             if let Some(joined) = attempt.run(taken, report) {
                 return Some((kept, moved, joined));
@@ -219,9 +248,15 @@ impl<'a> Attempt<'_, '_, 'a> {
         if candidates < self.params.min_registration_inliers {
             return None;
         }
-        let hypotheses = self.hypotheses(&crossings);
+        let mut hypotheses = self.hypotheses(&crossings);
         let mut verdicts: Vec<MergeVerdict> =
             hypotheses.iter().map(|hypothesis| self.judge(&crossings, hypothesis)).collect();
+        if !verdicts.contains(&MergeVerdict::Joined)
+            && let Some(local) = self.local_hypothesis(&crossings)
+        {
+            verdicts.push(self.judge(&crossings, &local));
+            hypotheses.push(local);
+        }
         let mut fit = verdicts.iter().enumerate().filter(|(_, verdict)| **verdict == MergeVerdict::Joined);
         let first = fit.next().map(|(at, _)| at);
         let rival =
@@ -259,7 +294,6 @@ impl<'a> Attempt<'_, '_, 'a> {
     /// Up to as many similarities as poses of one image, best first: each is sought among what the ones before leave.
     fn hypotheses(&self, crossings: &[Crossing]) -> Vec<Hypothesis> {
         let ransac = RansacParams { min_inliers: self.params.min_confirmed_inliers, ..self.params.ransac() };
-        let bound = self.params.max_error_sigma;
         let mut rest = crossings.to_vec();
         let mut found = Vec::new();
         for round in 0..self.params.max_pose_hypotheses as u64 {
@@ -269,32 +303,83 @@ impl<'a> Attempt<'_, '_, 'a> {
             if rest.iter().any(|crossing| !crossing.verified) {
                 candidates.extend(Sights::collect(&self.sides, rest.iter()).estimate(&ransac, seed));
             }
-            let score = |candidate: &Similarity| self.sides.score(&rest, candidate, bound);
-            let best = candidates
-                .into_iter()
-                .map(|candidate| self.refined(&rest, candidate))
-                .map(|candidate| (score(&candidate), candidate))
-                .reduce(|best, next| if next.0 < best.0 { next } else { best });
-            let Some((_, mut kept_from_moved)) = best else { break };
-            let mut agreeing = self.sides.agreeing(&rest, &kept_from_moved, bound);
-            let seen = self.seen(&kept_from_moved, &agreeing);
-            if distinct(&agreeing) >= MIN_SEED {
-                for max_angle_rad in GUIDED_BANDS_RAD {
-                    let guide = GuidedParams { max_angle_rad, ..GuidedParams::default() };
-                    let mut all = self.sides.guided(&kept_from_moved, &guide);
-                    all.extend_from_slice(&rest);
-                    let all = once(all);
-                    kept_from_moved = self.refined(&all, kept_from_moved);
-                    agreeing = self.sides.agreeing(&all, &kept_from_moved, bound);
-                }
-            }
-            let gone: BTreeSet<_> = agreeing.iter().map(|crossing| (crossing.kept, crossing.moved)).collect();
+            let Some((_, best)) = self.best_of(&rest, candidates) else { break };
+            let hypothesis = self.hypothesis(&rest, best);
+            let gone: BTreeSet<_> =
+                hypothesis.agreeing.iter().map(|crossing| (crossing.kept, crossing.moved)).collect();
             rest.retain(|crossing| !gone.contains(&(crossing.kept, crossing.moved)));
-            let support = distinct(&agreeing);
-            let likeness = self.likeness(&kept_from_moved, &agreeing);
-            found.push(Hypothesis { kept_from_moved, agreeing, support, seen, likeness });
+            found.push(hypothesis);
         }
         found
+    }
+
+    /// The best similarity that is found about single pairs, those with most verified matches.
+    ///
+    /// Of long parts that meet at one corner, a few images share a hundred matches, and all others match repeated
+    /// façades: random samples of all that crosses hardly ever consist of right ones (a twentieth of 3000).
+    fn local_hypothesis(&self, crossings: &[Crossing]) -> Option<Hypothesis> {
+        let ransac = RansacParams { min_inliers: self.params.min_confirmed_inliers, ..self.params.ransac() };
+        let mut counts: BTreeMap<[ImageId; 2], usize> = BTreeMap::new();
+        for crossing in crossings.iter().filter(|crossing| crossing.verified) {
+            *counts.entry([crossing.kept.image, crossing.moved.image]).or_default() += 1;
+        }
+        let mut pairs: Vec<[ImageId; 2]> = counts.keys().copied().collect();
+        pairs.sort_by_key(|pair| std::cmp::Reverse(counts[pair]));
+        pairs.truncate(LOCAL_PAIRS);
+        let about = |model: &Model<'_>, image: ImageId| -> Vec<ImageId> {
+            let center = |image: ImageId| model.poses[image.index()].map(|pose| *pose.center());
+            let Some(here) = center(image) else { return Vec::new() };
+            let distance = |image: &ImageId| center(*image).map_or(f64::INFINITY, |at| (at - here).norm());
+            let mut near: Vec<ImageId> = model.registered().collect();
+            near.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
+            near.truncate(LOCAL_IMAGES);
+            near
+        };
+        let seek = |[kept, moved]: [ImageId; 2]| {
+            let (kept, moved) = (about(self.sides.kept, kept), about(self.sides.moved, moved));
+            let near: Vec<Crossing> = crossings
+                .iter()
+                .filter(|crossing| {
+                    kept.contains(&crossing.kept.image) && moved.contains(&crossing.moved.image)
+                })
+                .copied()
+                .collect();
+            let candidates = Sights::collect(&self.sides, near.iter()).estimate(&ransac, self.seed);
+            let (_, best) = self.best_of(&near, candidates)?;
+            Some((self.sides.score(crossings, &best, self.params.max_error_sigma), best))
+        };
+        let found: Vec<(f64, Similarity)> = pairs.into_par_iter().with_max_len(1).filter_map(seek).collect();
+        let best = found.into_iter().reduce(|best, next| if next.0 < best.0 { next } else { best });
+        best.map(|(_, best)| self.hypothesis(crossings, best))
+    }
+
+    /// The candidate that explains the matches best, refined, with its score.
+    fn best_of(&self, crossings: &[Crossing], candidates: Vec<Similarity>) -> Option<(f64, Similarity)> {
+        candidates
+            .into_iter()
+            .map(|candidate| self.refined(crossings, candidate))
+            .map(|refined| (self.sides.score(crossings, &refined, self.params.max_error_sigma), refined))
+            .reduce(|best, next| if next.0 < best.0 { next } else { best })
+    }
+
+    /// The similarity with further matches that it shows, and what it is judged by.
+    fn hypothesis(&self, crossings: &[Crossing], mut kept_from_moved: Similarity) -> Hypothesis {
+        let bound = self.params.max_error_sigma;
+        let mut agreeing = self.sides.agreeing(crossings, &kept_from_moved, bound);
+        let seen = self.seen(&kept_from_moved, &agreeing);
+        if distinct(&agreeing) >= MIN_SEED {
+            for max_angle_rad in GUIDED_BANDS_RAD {
+                let guide = GuidedParams { max_angle_rad, ..GuidedParams::default() };
+                let mut all = self.sides.guided(&kept_from_moved, &guide);
+                all.extend_from_slice(crossings);
+                let all = once(all);
+                kept_from_moved = self.refined(&all, kept_from_moved);
+                agreeing = self.sides.agreeing(&all, &kept_from_moved, bound);
+            }
+        }
+        let support = distinct(&agreeing);
+        let likeness = self.likeness(&kept_from_moved, &agreeing);
+        Hypothesis { kept_from_moved, agreeing, support, seen, likeness }
     }
 
     /// A similarity fitted to what agrees with it, if that makes more agree.
@@ -508,7 +593,8 @@ impl<'a> Attempt<'_, '_, 'a> {
     fn join(&self, hypothesis: &Hypothesis, taken: Vec<bool>) -> Option<Mapper<'a>> {
         let input = self.sides.kept.input;
         let components = [&self.kept.component, &self.moved.component];
-        let model = Model::of_components(input, components[0], components[1], &hypothesis.kept_from_moved);
+        let model =
+            Model::of_components(input, components[0], components[1], &hypothesis.kept_from_moved, &taken);
         let mut mapper = Mapper::over(self.params, model, taken, self.seed);
         let anchors = self.kept.anchors.iter().zip(&self.moved.anchors);
         mapper.anchors = anchors.map(|(of_kept, of_moved)| of_kept.or(*of_moved)).collect();
@@ -523,8 +609,12 @@ impl<'a> Attempt<'_, '_, 'a> {
         if !self.holds(&mapper) {
             return None;
         }
+        let before = mapper.model.registered_count();
         mapper.grow();
-        mapper.finish();
+        if mapper.model.registered_count() > before {
+            mapper.refine(2, 20);
+        }
+        mapper.replace_misplaced();
         let stays = |image: ImageId| mapper.model.is_registered(image);
         let all_stay = components.iter().all(|component| component.registered().all(stays));
         all_stay.then_some(mapper)

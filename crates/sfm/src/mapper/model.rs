@@ -54,8 +54,14 @@ pub(super) struct Model<'a> {
 const NO_POINT: u32 = u32::MAX;
 
 impl<'a> Model<'a> {
+    #[cfg(test)]
     pub fn new(input: &'a MapperInput<'a>) -> Self {
         Self::with_cameras(input, input.cameras.clone(), |_| true)
+    }
+
+    /// An empty model that these images never join; they have no rays.
+    pub fn without(input: &'a MapperInput<'a>, taken: &[bool]) -> Self {
+        Self::with_cameras(input, input.cameras.clone(), |image| !taken[image])
     }
 
     /// The model of a finished component; the places of its points are their ids. Images outside have no rays.
@@ -66,14 +72,15 @@ impl<'a> Model<'a> {
         model
     }
 
-    /// The model of a component that other images may join.
-    pub fn open(input: &'a MapperInput<'a>, component: &Reconstruction) -> Self {
-        let mut model = Self::with_cameras(input, component.cameras.clone(), |_| true);
+    /// The model of a component that images may join but those that are taken, which have no rays.
+    pub fn open(input: &'a MapperInput<'a>, component: &Reconstruction, taken: &[bool]) -> Self {
+        let mut model = Self::with_cameras(input, component.cameras.clone(), |image| !taken[image]);
         model.take_in(component, &Similarity::identity());
         model
     }
 
-    /// The model of two components, the points of `moved` after those of `kept`.
+    /// The model of two components, the points of `moved` after those of `kept`, that images may join as one may
+    /// [`Model::open`].
     ///
     /// Intrinsics that were found in both are those of `kept`.
     pub fn of_components(
@@ -81,13 +88,14 @@ impl<'a> Model<'a> {
         kept: &Reconstruction,
         moved: &Reconstruction,
         kept_from_moved: &Similarity,
+        taken: &[bool],
     ) -> Self {
         let mut cameras = moved.cameras.clone();
         for image in kept.registered() {
             let camera = input.images[image.index()].camera.index();
             cameras[camera] = kept.cameras[camera].clone();
         }
-        let mut model = Self::with_cameras(input, cameras, |_| true);
+        let mut model = Self::with_cameras(input, cameras, |image| !taken[image]);
         model.take_in(kept, &Similarity::identity());
         model.take_in(moved, kept_from_moved);
         model
