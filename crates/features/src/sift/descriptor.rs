@@ -186,8 +186,9 @@ vectorized! {
     }
 }
 
-/// The whole number below a number of [0, 5), or itself or the one below a whole number. Compilers leave conversions to integers,
-/// which have to bear any number, one by one.
+/// The whole part of a number within [0, 5), of a whole number itself or one less.
+///
+/// Conversions to integers have to bear any number, and compilers leave them to be done one by one.
 #[inline(always)]
 fn whole_cells(cells: f32) -> f32 {
     // In floats of this size the last bit is worth 1.
