@@ -439,19 +439,34 @@ fn grow_again(
     seed: u64,
 ) -> Vec<Part> {
     for at in 0..parts.len() {
-        let taken = merge::taken_by_others(input, &parts, &[at]);
-        let part = &parts[at];
-        let mut mapper = Mapper::over(params, Model::open(input, &part.component, &taken), taken, seed);
-        mapper.anchors.clone_from(&part.anchors);
-        mapper.witnesses = Some(witnesses);
-        mapper.refine(2, 20);
-        mapper.grow();
-        mapper.finish();
-        report.registrations.append(&mut mapper.records);
-        parts[at] = mapper.into_part();
+        rework(params, input, &mut parts, at, report, seed, |mapper| {
+            mapper.witnesses = Some(witnesses);
+            mapper.refine(2, 20);
+            mapper.grow();
+            mapper.finish();
+        });
     }
     parts.sort_by_key(|part| Reverse(part.component.registered().count()));
     parts
+}
+
+/// Opens one of the parts to images that no other has, and puts what work makes of it in its place.
+fn rework<'a>(
+    params: &'a MapperParams,
+    input: &'a MapperInput<'a>,
+    parts: &mut [Part],
+    at: usize,
+    report: &mut MapperReport,
+    seed: u64,
+    work: impl FnOnce(&mut Mapper<'a>),
+) {
+    let taken = merge::taken_by_others(input, parts, &[at]);
+    let part = &parts[at];
+    let mut mapper = Mapper::over(params, Model::open(input, &part.component, &taken), taken, seed);
+    mapper.anchors.clone_from(&part.anchors);
+    work(&mut mapper);
+    report.registrations.append(&mut mapper.records);
+    parts[at] = mapper.into_part();
 }
 
 /// The parts as they are handed over.

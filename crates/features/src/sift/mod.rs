@@ -21,6 +21,7 @@ use descriptor::{DescriptorRows, Frame, describe, prefetch};
 use extrema::{Extremum, Scan};
 use octave::{Octave, Sigmas, Source};
 use orientation::{OrientationRows, orientations};
+use plane::Plane;
 use vectorized::Level;
 
 use crate::DESCRIPTOR_LEN;
@@ -137,7 +138,7 @@ impl Workspace {
             let plane = |at: usize| (chosen[at].octave, chosen[at].layer);
             plane(a).cmp(&plane(b)).then(chosen[a].y.total_cmp(&chosen[b].y))
         });
-        let place = |at: usize| {
+        let placed = |&at: &usize| {
             let point = &chosen[at];
             let pixel = params.pixel_of(point.octave);
             let place = |at: f32| (at - params.first_center()) / pixel;
@@ -149,14 +150,13 @@ impl Workspace {
             };
             (&self.octaves[point.octave as usize].layers[point.layer as usize], frame)
         };
+        let placed: Vec<(&Plane, Frame)> = order.iter().map(placed).collect();
         let mut descriptors = vec![[0.0; DESCRIPTOR_LEN]; chosen.len()];
-        for (index, &at) in order.iter().enumerate() {
-            if let Some(&next) = order.get(index + 1) {
-                let (plane, frame) = place(next);
-                prefetch(plane, &frame);
+        for (index, (plane, frame)) in placed.iter().enumerate() {
+            if let Some((plane, next)) = placed.get(index + 1) {
+                prefetch(plane, next);
             }
-            let (plane, frame) = place(at);
-            descriptors[at] = describe(level, plane, &frame, &mut self.descriptor_rows);
+            descriptors[order[index]] = describe(level, plane, frame, &mut self.descriptor_rows);
         }
         descriptors
     }

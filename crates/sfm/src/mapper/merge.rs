@@ -31,6 +31,7 @@ use super::{
     model::Model,
     neighbours::{Neighbours, neighbours, share_as_neighbours},
     register::{Visibility, visibility, visibility_beside},
+    rework,
     structure::{complete_and_merge, connect},
 };
 use crate::{ImageId, PointId, Rigid, Similarity, robust::RansacParams};
@@ -159,13 +160,7 @@ pub(super) fn join_supported(
     }
     for at in 0..parts.len() {
         if parts[at].component.registered().any(|image| joined_images.contains(&image)) {
-            let taken = taken_by_others(input, &parts, &[at]);
-            let part = &parts[at];
-            let mut mapper = Mapper::over(params, Model::open(input, &part.component, &taken), taken, seed);
-            mapper.anchors.clone_from(&part.anchors);
-            mapper.finish();
-            report.registrations.append(&mut mapper.records);
-            parts[at] = mapper.into_part();
+            rework(params, input, &mut parts, at, report, seed, Mapper::finish);
         }
     }
     parts.sort_by_key(|part| std::cmp::Reverse(part.size()));
@@ -291,9 +286,13 @@ impl<'a> Attempt<'_, '_, 'a> {
         Some(mapper.into_part())
     }
 
+    fn ransac(&self) -> RansacParams {
+        RansacParams { min_inliers: self.params.min_confirmed_inliers, ..self.params.ransac() }
+    }
+
     /// Up to as many similarities as poses of one image, best first: each is sought among what the ones before leave.
     fn hypotheses(&self, crossings: &[Crossing]) -> Vec<Hypothesis> {
-        let ransac = RansacParams { min_inliers: self.params.min_confirmed_inliers, ..self.params.ransac() };
+        let ransac = self.ransac();
         let mut rest = crossings.to_vec();
         let mut found = Vec::new();
         for round in 0..self.params.max_pose_hypotheses as u64 {
@@ -318,7 +317,7 @@ impl<'a> Attempt<'_, '_, 'a> {
     /// Of long parts that meet at one corner, a few images share a hundred matches, and all others match repeated
     /// façades: random samples of all that crosses hardly ever consist of right ones (a twentieth of 3000).
     fn local_hypothesis(&self, crossings: &[Crossing]) -> Option<Hypothesis> {
-        let ransac = RansacParams { min_inliers: self.params.min_confirmed_inliers, ..self.params.ransac() };
+        let ransac = self.ransac();
         let mut counts: BTreeMap<[ImageId; 2], usize> = BTreeMap::new();
         for crossing in crossings.iter().filter(|crossing| crossing.verified) {
             *counts.entry([crossing.kept.image, crossing.moved.image]).or_default() += 1;
@@ -349,7 +348,7 @@ impl<'a> Attempt<'_, '_, 'a> {
             Some((self.sides.score(crossings, &best, self.params.max_error_sigma), best))
         };
         let found: Vec<(f64, Similarity)> = pairs.into_par_iter().with_max_len(1).filter_map(seek).collect();
-        let best = found.into_iter().reduce(|best, next| if next.0 < best.0 { next } else { best });
+        let best = found.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
         best.map(|(_, best)| self.hypothesis(crossings, best))
     }
 
@@ -359,7 +358,7 @@ impl<'a> Attempt<'_, '_, 'a> {
             .into_iter()
             .map(|candidate| self.refined(crossings, candidate))
             .map(|refined| (self.sides.score(crossings, &refined, self.params.max_error_sigma), refined))
-            .reduce(|best, next| if next.0 < best.0 { next } else { best })
+            .min_by(|a, b| a.0.total_cmp(&b.0))
     }
 
     /// The similarity with further matches that it shows, and what it is judged by.
