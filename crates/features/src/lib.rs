@@ -67,8 +67,8 @@ pub use features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Keypoint, Ray
 pub use geodesy::Wgs84;
 pub use mask::Mask;
 pub use matching::{
-    DescriptorBlock, GuidedParams, Match, MatchParams, Posture, TwoNearest, match_features, match_guided,
-    squared_distance, two_nearest,
+    DescriptorBlock, Elevations, GuidedParams, Match, MatchParams, Posture, TwoNearest, match_features,
+    match_guided, squared_distance, two_nearest,
 };
 pub use nearby::NearbyKeypoints;
 pub use patch::{Aligned, ImagePyramid, Patch, PatchFrame, PatchParams, Template};

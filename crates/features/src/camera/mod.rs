@@ -370,6 +370,12 @@ impl Camera {
         self.params.first().copied().filter(|_| self.is_panoramic())
     }
 
+    /// Height in pixels of a panorama from pole to pole, and how much of it a crop leaves out above; `None` for photos.
+    pub fn half_turn_px(&self) -> Option<(f64, f64)> {
+        let top = self.params.get(3).copied().unwrap_or(0.0);
+        self.params.get(1).filter(|_| self.is_panoramic()).map(|&height| (height, top))
+    }
+
     /// The mean focal length in pixels; for panoramas the pixels per radian at the horizon.
     pub fn focal_length(&self) -> f64 {
         match self.lens() {

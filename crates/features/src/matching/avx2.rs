@@ -12,7 +12,7 @@ use std::arch::x86_64::{
 
 use bytemuck::{Pod, Zeroable};
 
-use super::kernel::{Line, PackedBase, PackedQueries, Slots, squared_norm};
+use super::kernel::{Comparisons, Line, PackedBase, PackedQueries, Slots, squared_norm};
 use super::tiles::{self, Instructions, Lanes, Products, VECTORS};
 use crate::DESCRIPTOR_LEN;
 
@@ -111,13 +111,14 @@ fn pack_base<K: Instructions<ROWS, LANES>, T: Pod, const PER_LANE: usize>(
     PackedBase { lines, terms }
 }
 
-/// Updates the best two of all rows and, if `both`, of all columns.
+/// Updates the best two of all rows and, if `both`, of all columns, of those that are compared.
 pub(super) fn search<K: Instructions<ROWS, LANES, Lanes = Avx2>>(
     kernel: K,
     queries: &PackedQueries,
     base: &PackedBase,
     rows: &mut Slots,
     columns: &mut Slots,
+    compared: impl Comparisons,
     both: bool,
 ) {
     #[target_feature(enable = "avx2")]
@@ -127,15 +128,16 @@ pub(super) fn search<K: Instructions<ROWS, LANES, Lanes = Avx2>>(
         base: &PackedBase,
         rows: &mut Slots,
         columns: &mut Slots,
+        compared: impl Comparisons,
     ) {
-        tiles::search::<_, ROWS, LANES, COLUMNS>(kernel, queries, base, rows, columns);
+        tiles::search::<_, ROWS, LANES, COLUMNS>(kernel, queries, base, rows, columns, compared);
     }
     // SAFETY: the instructions are there, as `kernel` proves.
     unsafe {
         if both {
-            compiled::<K, true>(kernel, queries, base, rows, columns);
+            compiled::<K, true>(kernel, queries, base, rows, columns, compared);
         } else {
-            compiled::<K, false>(kernel, queries, base, rows, columns);
+            compiled::<K, false>(kernel, queries, base, rows, columns, compared);
         }
     }
 }

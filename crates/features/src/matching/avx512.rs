@@ -8,7 +8,7 @@ use std::arch::x86_64::{
     _mm512_set1_epi32, _mm512_slli_epi32, _mm512_storeu_si512, _mm512_sub_epi32,
 };
 
-use super::kernel::{Line, PackedBase, PackedQueries, Slots};
+use super::kernel::{Comparisons, Line, PackedBase, PackedQueries, Slots};
 use super::tiles::{self, Instructions, Lanes, Products, VECTORS};
 
 /// Queries per register tile; with 2 base vectors that makes 24 accumulators of the 32 registers.
@@ -55,14 +55,15 @@ impl Avx512 {
         base: &PackedBase,
         rows: &mut Slots,
         columns: &mut Slots,
+        compared: impl Comparisons,
         both: bool,
     ) {
         // SAFETY: the instructions are there, as `self` proves.
         unsafe {
             if both {
-                search::<true>(self, queries, base, rows, columns);
+                search::<true>(self, queries, base, rows, columns, compared);
             } else {
-                search::<false>(self, queries, base, rows, columns);
+                search::<false>(self, queries, base, rows, columns, compared);
             }
         }
     }
@@ -75,8 +76,9 @@ fn search<const COLUMNS: bool>(
     base: &PackedBase,
     rows: &mut Slots,
     columns: &mut Slots,
+    compared: impl Comparisons,
 ) {
-    tiles::search::<_, ROWS, LANES, COLUMNS>(kernel, queries, base, rows, columns);
+    tiles::search::<_, ROWS, LANES, COLUMNS>(kernel, queries, base, rows, columns, compared);
 }
 
 // SAFETY of all intrinsics: `self` proves that the instructions are there.

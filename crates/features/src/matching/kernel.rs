@@ -6,8 +6,6 @@
 //! matching, of its columns (base) in the same pass. A comparison with the second-best distances skips nearly all
 //! updates, so the product dominates.
 
-use std::ops::Range;
-
 use bytemuck::{Pod, Zeroable};
 
 use super::count;
@@ -22,6 +20,62 @@ use crate::DESCRIPTOR_LEN;
 pub(super) const UNSEEN: i32 = 1 << 28;
 /// Term of a padding row or column: lifts it above [`UNSEEN`].
 pub(super) const PADDING: i32 = 1 << 29;
+
+/// Queries that are compared together with the same base descriptors; whole register tiles of every kernel.
+pub(super) const QUERY_BLOCK: usize = 12;
+/// Base descriptors that are compared together with the same queries; whole register tiles of every kernel.
+pub(super) const BASE_BLOCK: usize = 32;
+
+/// Which queries are compared with which base descriptors, block by block, so that all kernels compare the same.
+pub(super) trait Comparisons: Copy {
+    /// Whether the blocks that this query and this base descriptor lie in are compared.
+    fn has(self, query: usize, base: usize) -> bool;
+}
+
+/// Each with each.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct All;
+
+impl Comparisons for All {
+    #[inline(always)]
+    fn has(self, _: usize, _: usize) -> bool {
+        true
+    }
+}
+
+/// Some blocks with some.
+#[derive(Debug)]
+pub(super) struct BlockPairs {
+    /// Words of one block of queries, a bit for each block of base descriptors.
+    words: usize,
+    bits: Vec<u64>,
+}
+
+impl BlockPairs {
+    /// Those of so many blocks of which `compares` says so.
+    pub fn new(
+        num_query_blocks: usize,
+        num_base_blocks: usize,
+        compares: impl Fn(usize, usize) -> bool,
+    ) -> Self {
+        let words = num_base_blocks.div_ceil(64);
+        let mut bits = vec![0; num_query_blocks * words];
+        for query in 0..num_query_blocks {
+            for base in (0..num_base_blocks).filter(|&base| compares(query, base)) {
+                bits[query * words + base / 64] |= 1 << (base % 64);
+            }
+        }
+        Self { words, bits }
+    }
+}
+
+impl Comparisons for &BlockPairs {
+    #[inline(always)]
+    fn has(self, query: usize, base: usize) -> bool {
+        let (query, base) = (query / QUERY_BLOCK, base / BASE_BLOCK);
+        self.bits[query * self.words + base / 64] >> (base % 64) & 1 != 0
+    }
+}
 
 /// The nearest descriptor and the distances of the nearest two.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -136,16 +190,17 @@ impl Kernel {
         base: &PackedBase,
         rows: &mut Slots,
         columns: &mut Slots,
+        compared: impl Comparisons,
         both: bool,
     ) {
         match self {
-            Self::Scalar => search_scalar(queries, base, rows, columns),
+            Self::Scalar => search_scalar(queries, base, rows, columns, compared),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2Words(kernel) => avx2::search(kernel, queries, base, rows, columns, both),
+            Self::Avx2Words(kernel) => avx2::search(kernel, queries, base, rows, columns, compared, both),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2Bytes(kernel) => avx2::search(kernel, queries, base, rows, columns, both),
+            Self::Avx2Bytes(kernel) => avx2::search(kernel, queries, base, rows, columns, compared, both),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512(kernel) => kernel.search(queries, base, rows, columns, both),
+            Self::Avx512(kernel) => kernel.search(queries, base, rows, columns, compared, both),
         }
     }
 }
@@ -190,15 +245,13 @@ pub(super) struct Slots {
     pub best: Vec<i32>,
     pub second: Vec<i32>,
     pub index: Vec<u32>,
-    /// Number of the first descriptor that is searched.
-    pub first_index: u32,
 }
 
 impl Slots {
     fn new(len: usize, padded: usize) -> Self {
         let mut second = vec![UNSEEN; len];
         second.resize(padded, i32::MIN);
-        Self { best: vec![UNSEEN; padded], second, index: vec![TwoNearest::NO_INDEX; padded], first_index: 0 }
+        Self { best: vec![UNSEEN; padded], second, index: vec![TwoNearest::NO_INDEX; padded] }
     }
 
     #[inline(always)]
@@ -206,7 +259,7 @@ impl Slots {
         if distance2 < self.best[slot] {
             self.second[slot] = self.best[slot];
             self.best[slot] = distance2;
-            self.index[slot] = self.first_index + index as u32;
+            self.index[slot] = index as u32;
         } else if distance2 < self.second[slot] {
             self.second[slot] = distance2;
         }
@@ -274,7 +327,7 @@ impl DescriptorBlock {
 
     /// The nearest two of each query (row-major, `n × DESCRIPTOR_LEN` bytes), indices counted within the block.
     pub fn two_nearest(&self, queries: &[u8]) -> Vec<TwoNearest> {
-        self.search(queries, false).0
+        self.search(queries, All, false).0
     }
 
     /// Merges the nearest two of each query into `nearest`, with this block's descriptors numbered from `first_index`.
@@ -290,12 +343,17 @@ impl DescriptorBlock {
         }
     }
 
-    fn search(&self, queries: &[u8], both: bool) -> (Vec<TwoNearest>, Vec<TwoNearest>) {
+    fn search(
+        &self,
+        queries: &[u8],
+        compared: impl Comparisons,
+        both: bool,
+    ) -> (Vec<TwoNearest>, Vec<TwoNearest>) {
         let num_queries = count(queries);
         let packed = self.kernel.pack_queries(queries);
         let mut rows = Slots::new(num_queries, packed.terms.len());
         let mut columns = Slots::new(self.len, self.base.terms.len());
-        self.kernel.search(&packed, &self.base, &mut rows, &mut columns, both);
+        self.kernel.search(&packed, &self.base, &mut rows, &mut columns, compared, both);
         (rows.finish(num_queries), if both { columns.finish(self.len) } else { Vec::new() })
     }
 }
@@ -305,46 +363,16 @@ pub fn two_nearest(queries: &[u8], base: &[u8]) -> Vec<TwoNearest> {
     DescriptorBlock::with_kernel(Kernel::detect_for(queries, base), base).two_nearest(queries)
 }
 
-/// Both directions in one pass: for each query its nearest two of `base`, for each of `base` its nearest two queries.
-pub(super) fn two_nearest_both(queries: &[u8], base: &[u8]) -> (Vec<TwoNearest>, Vec<TwoNearest>) {
-    DescriptorBlock::with_kernel(Kernel::detect_for(queries, base), base).search(queries, true)
-}
-
-/// [`two_nearest_both`] of descriptors that lie in groups, comparing only groups of which `compares` says so.
+/// Both directions in one pass: for each query its nearest two of `base`, for each of `base` its nearest two queries, among
+/// those that are compared.
 ///
-/// Groups are adjacent, given by where they end. At equal distance the earlier group wins, and in it the lower index.
-pub(super) fn two_nearest_of_groups(
-    (queries, query_ends): (&[u8], &[usize]),
-    (base, base_ends): (&[u8], &[usize]),
-    compares: impl Fn(usize, usize) -> bool,
+/// At equal distance the lower index wins.
+pub(super) fn two_nearest_both(
+    queries: &[u8],
+    base: &[u8],
+    compared: impl Comparisons,
 ) -> (Vec<TwoNearest>, Vec<TwoNearest>) {
-    let kernel = Kernel::detect_for(queries, base);
-    let groups_of = |ends: &[usize]| -> Vec<Range<usize>> {
-        let starts = std::iter::once(0).chain(ends.iter().copied());
-        starts.zip(ends).map(|(start, &end)| start..end).collect()
-    };
-    let bytes = |group: &Range<usize>| group.start * DESCRIPTOR_LEN..group.end * DESCRIPTOR_LEN;
-    let (query_groups, base_groups) = (groups_of(query_ends), groups_of(base_ends));
-    let blocks: Vec<DescriptorBlock> =
-        base_groups.iter().map(|group| DescriptorBlock::with_kernel(kernel, &base[bytes(group)])).collect();
-    // Best distances are carried on from group to group: nearly nothing is an update then.
-    let mut columns: Vec<Slots> =
-        blocks.iter().map(|block| Slots::new(block.len, block.base.terms.len())).collect();
-    let mut nearest_of_queries = Vec::with_capacity(count(queries));
-    for (at, query_group) in query_groups.iter().enumerate() {
-        let packed = kernel.pack_queries(&queries[bytes(query_group)]);
-        let mut rows = Slots::new(query_group.len(), packed.terms.len());
-        for (of, (base_group, block)) in base_groups.iter().zip(&blocks).enumerate() {
-            if compares(at, of) {
-                rows.first_index = base_group.start as u32;
-                columns[of].first_index = query_group.start as u32;
-                kernel.search(&packed, &block.base, &mut rows, &mut columns[of], true);
-            }
-        }
-        nearest_of_queries.extend(rows.finish(query_group.len()));
-    }
-    let of_base = columns.iter().zip(&blocks).flat_map(|(slots, block)| slots.finish(block.len));
-    (nearest_of_queries, of_base.collect())
+    DescriptorBlock::with_kernel(Kernel::detect_for(queries, base), base).search(queries, compared, true)
 }
 
 pub(super) fn squared_norm(descriptor: &[u8]) -> i32 {
@@ -367,11 +395,18 @@ fn terms_of(descriptors: &[u8]) -> Vec<i32> {
     descriptors.chunks_exact(DESCRIPTOR_LEN).map(squared_norm).collect()
 }
 
-fn search_scalar(queries: &PackedQueries, base: &PackedBase, rows: &mut Slots, columns: &mut Slots) {
+fn search_scalar(
+    queries: &PackedQueries,
+    base: &PackedBase,
+    rows: &mut Slots,
+    columns: &mut Slots,
+    compared: impl Comparisons,
+) {
     let base_bytes: &[u8] = bytemuck::cast_slice(&base.lines);
     let query_bytes: &[u8] = bytemuck::cast_slice(&queries.lines);
     for (row, query) in query_bytes.chunks_exact(DESCRIPTOR_LEN).enumerate() {
-        for (column, candidate) in base_bytes.chunks_exact(DESCRIPTOR_LEN).enumerate() {
+        let candidates = base_bytes.chunks_exact(DESCRIPTOR_LEN).enumerate();
+        for (column, candidate) in candidates.filter(|(column, _)| compared.has(row, *column)) {
             let product: i32 = query.iter().zip(candidate).map(|(&a, &b)| i32::from(a) * i32::from(b)).sum();
             let distance2 = queries.terms[row] + base.terms[column] - 2 * product;
             rows.update(row, distance2, column);
@@ -427,7 +462,8 @@ mod tests {
                 };
                 let (queries, base) = (random(num_queries), random(num_base));
                 for kernel in kernels(&queries, &base) {
-                    let (rows, columns) = DescriptorBlock::with_kernel(kernel, &base).search(&queries, true);
+                    let (rows, columns) =
+                        DescriptorBlock::with_kernel(kernel, &base).search(&queries, All, true);
                     assert_eq!(rows, naive(&queries, &base), "{kernel:?} {num_queries} × {num_base}");
                     assert_eq!(columns, naive(&base, &queries), "{kernel:?} {num_queries} × {num_base}");
                     let one_way = DescriptorBlock::with_kernel(kernel, &base).two_nearest(&queries);
@@ -473,27 +509,31 @@ mod tests {
     }
 
     #[test]
-    fn groups_are_compared_as_asked() {
+    fn blocks_are_compared_as_asked_by_all_kernels() {
         let mut rng = ChaCha8Rng::seed_from_u64(6);
         let mut random = |count: usize| -> Vec<u8> {
             (0..count * DESCRIPTOR_LEN).map(|_| rng.random_range(0..=50)).collect()
         };
-        let (queries, base) = (random(50), random(80));
-        let (query_ends, base_ends) = ([20, 20, 50], [7, 80]);
-        let group = |ends: &[usize], at: usize| ends.iter().position(|&end| at < end).unwrap();
-        let compares = |query: usize, base: usize| query + base == 2;
-        let (rows, columns) = two_nearest_of_groups((&queries, &query_ends), (&base, &base_ends), compares);
-        let mut expected = (vec![TwoNearest::NONE; 50], vec![TwoNearest::NONE; 80]);
+        // More blocks of base descriptors than bits in a word, and last blocks that are not full.
+        let (num_queries, num_base) = (53, 66 * BASE_BLOCK + 7);
+        let (queries, base) = (random(num_queries), random(num_base));
+        let compares = |query: usize, base: usize| (query + base).is_multiple_of(3);
+        let compared =
+            BlockPairs::new(num_queries.div_ceil(QUERY_BLOCK), num_base.div_ceil(BASE_BLOCK), compares);
+        let mut expected = (vec![TwoNearest::NONE; num_queries], vec![TwoNearest::NONE; num_base]);
         for (row, query) in queries.chunks_exact(DESCRIPTOR_LEN).enumerate() {
             for (column, candidate) in base.chunks_exact(DESCRIPTOR_LEN).enumerate() {
-                if compares(group(&query_ends, row), group(&base_ends, column)) {
+                if compares(row / QUERY_BLOCK, column / BASE_BLOCK) {
                     let distance2 = squared_distance(query, candidate);
                     expected.0[row].offer(column as u32, distance2);
                     expected.1[column].offer(row as u32, distance2);
                 }
             }
         }
-        assert_eq!((rows, columns), expected);
+        for kernel in kernels(&queries, &base) {
+            let found = DescriptorBlock::with_kernel(kernel, &base).search(&queries, &compared, true);
+            assert_eq!(found, expected, "{kernel:?}");
+        }
     }
 
     #[test]

@@ -9,6 +9,7 @@ mod kernel;
 mod tiles;
 
 use std::collections::BTreeMap;
+use std::f32::consts::PI;
 use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
@@ -74,8 +75,9 @@ impl MatchParams {
     /// 1: exact two nearest neighbours, ratio and mutual test.
     /// 2: bright and dark spots apart, screened by the strongest. 3: simulated views. 4: which do not count among those
     /// that are worth screening. 5: without the last bit of descriptors; keypoints of level images that are turned alike.
-    /// 6: small images are taken for level by their strongest keypoints, too.
-    pub const VERSION: u32 = 6;
+    /// 6: small images are taken for level by their strongest keypoints, too. 7: keypoints of level images that can show the
+    /// same by height and size, too.
+    pub const VERSION: u32 = 7;
 
     /// Checks the ranges.
     ///
@@ -99,8 +101,8 @@ impl Default for MatchParams {
             ratio: 0.8,
             mutual: true,
             max_distance: 1.0,
-            screen_features: 2048,
-            screen_matches: 10,
+            screen_features: 1024,
+            screen_matches: 5,
             simulate_below: 300,
         }
     }
@@ -117,11 +119,12 @@ fn passes(nearest: &TwoNearest, ratio: f64, max_distance: f64) -> bool {
 }
 
 /// How two images are held.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Posture {
-    /// Their columns are vertical, as those of street-view panoramas are: what stands upright in one does in the other.
-    Level,
+    /// Their columns are vertical, as those of street-view panoramas are: what stands upright in one does in the other,
+    /// and what is above the camera's height in one is in the other. (Of each image, first and second.)
+    Level([Elevations; 2]),
     /// Anyhow.
     Any,
 }
@@ -129,7 +132,36 @@ pub enum Posture {
 impl Posture {
     /// Level where both are panoramas.
     pub fn of(cameras: [&Camera; 2]) -> Self {
-        if cameras.iter().all(|camera| camera.is_panoramic()) { Self::Level } else { Self::Any }
+        match cameras.map(Elevations::of) {
+            [Some(first), Some(second)] => Self::Level([first, second]),
+            _ => Self::Any,
+        }
+    }
+}
+
+/// Which elevation each row of a panorama shows.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Elevations {
+    /// Rows of the whole panorama, from pole to pole.
+    rows: f32,
+    /// How many of them are cropped above the image.
+    top: f32,
+}
+
+impl Elevations {
+    fn of(camera: &Camera) -> Option<Self> {
+        let (rows, top) = camera.half_turn_px()?;
+        Some(Self { rows: rows as f32, top: top as f32 })
+    }
+
+    /// The elevation that a row shows, in radians above the horizon.
+    fn at(self, row: f32) -> f32 {
+        (0.5 - (row + self.top) / self.rows) * PI
+    }
+
+    /// Radians that a row spans.
+    fn per_row(self) -> f32 {
+        PI / self.rows
     }
 }
 
@@ -137,16 +169,17 @@ impl Posture {
 ///
 /// Spots brighter than their surround are compared with such spots only, darker ones with darker ones. Most pairs of a
 /// large set show different places; they are recognized by their strongest keypoints, which then match no more than
-/// by chance (about 20 of 4096), and spare the other fifteen sixteenths of the work.
+/// by chance (some 10 of 2048), and spare nearly all of the work.
 /// Distances are those of descriptors without the last bit of each byte, exact integers, and ties go to the lower index
-/// (among keypoints turned alike to the lower orientation), so the result is the same on every processor. With
+/// (in level images to the first of those that are like each other), so the result is the same on every processor. With
 /// `mutual` both images' keypoints must pass the ratio test. Single-threaded: callers work on many pairs in parallel.
 /// Matches come in ascending order.
 ///
 /// In level images what shows the same is turned alike, so keypoints are compared only with those turned by up to some
-/// 45° from them, but all keypoints of the ground with each other, and all of ceilings: half of the work, and
-/// fewer to be confused with. Where the strongest keypoints match otherwise the images are not level, and all
-/// are compared.
+/// 45° from them, but all keypoints of the ground with each other, and all of ceilings. What is above one camera
+/// is not below the other; and how large a thing looks, relative to the sine of its elevation, is the same in both,
+/// so that keypoints up to 1.5 octaves apart in this are compared: a quarter of the work, and fewer to
+/// be confused with. Where the strongest keypoints match otherwise the images are not level, and all are compared.
 ///
 /// Simulated views are matched one by one, each with the other image itself, so that a keypoint does not compete in
 /// the ratio test with its own likes of other views. Of matches that say the same (both ends within
@@ -158,7 +191,7 @@ pub fn match_features(
     first: &ImageFeatures,
     second: &ImageFeatures,
 ) -> Vec<Match> {
-    let worth_screening = |features: &ImageFeatures| features.own_len() >= 4 * params.screen_features;
+    let worth_screening = |features: &ImageFeatures| features.own_len() >= 8 * params.screen_features;
     let mut strongest = None;
     if params.screen_features > 0 && worth_screening(first) && worth_screening(second) {
         let found = match_strongest(params, params.screen_features, first, second);
@@ -183,15 +216,17 @@ fn match_own(
     strongest: Option<Vec<Match>>,
 ) -> Vec<Match> {
     let all = || match_all(params, (first, first.parts()), (second, second.parts()));
-    if posture == Posture::Any {
+    let Posture::Level(elevations) = posture else {
         return all();
-    }
+    };
     let sample = strongest.unwrap_or_else(|| match_strongest(params, alike::SAMPLE, first, second));
-    if alike::contradict(&sample, first, second) {
+    if alike::contradict(&sample, elevations, first, second) {
         return all();
     }
     let of_parts = first.parts().into_iter().zip(second.parts());
-    let alike_in = |(of_first, of_second)| alike::match_parts(params, (first, of_first), (second, of_second));
+    let alike_in = |(of_first, of_second)| {
+        alike::match_parts(params, (first, of_first, elevations[0]), (second, of_second, elevations[1]))
+    };
     of_parts.flat_map(alike_in).collect()
 }
 
@@ -285,7 +320,7 @@ fn match_parts(params: &MatchParams, first: &[u8], second: &[u8]) -> Vec<Match> 
     let [first, second] = [first, second].map(|part| halved(part).collect::<Vec<_>>());
     let (first, second) = (&first[..], &second[..]);
     if params.mutual {
-        let (forward, backward) = kernel::two_nearest_both(first, second);
+        let (forward, backward) = kernel::two_nearest_both(first, second, kernel::All);
         mutual(params, &forward, &backward)
     } else {
         collect(&two_nearest(first, second), |nearest| params.accepts(nearest), |_, _| true)
@@ -329,13 +364,11 @@ fn count(descriptors: &[u8]) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use std::f32::consts::FRAC_PI_2;
-
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
-    use crate::SimulatedView;
+    use crate::{CameraModel, SimulatedView};
 
     fn features(descriptors: Vec<u8>) -> ImageFeatures {
         let keypoints = vec![bytemuck::Zeroable::zeroed(); count(&descriptors)];
@@ -399,39 +432,79 @@ mod tests {
         assert_eq!(with(false), [Match { first: 0, second: 0 }, Match { first: 1, second: 0 }]);
     }
 
-    #[test]
-    fn keypoints_of_level_images_match_those_turned_alike() {
-        let mut rng = ChaCha8Rng::seed_from_u64(8);
-        let descriptors = random(&mut rng, 200);
-        // Twice the place, the second time turned by 90°: a repetition for all keypoints, none for those alike.
-        let turned = |turns: &[f32]| {
-            let mut features = features(descriptors.repeat(turns.len()));
-            for (at, keypoint) in features.keypoints.iter_mut().enumerate() {
-                keypoint.orientation = at as f32 * 0.1 + turns[at / 200];
-            }
-            features
+    /// Whole panoramas of 3600 × 1800 pixels.
+    fn level() -> Posture {
+        let camera = Camera {
+            model: CameraModel::Equirectangular,
+            width: 3600,
+            height: 1800,
+            params: vec![3600.0, 1800.0],
         };
-        let (once, twice, far) = (turned(&[0.0]), turned(&[0.6, FRAC_PI_2]), turned(&[2.0]));
-        let matched = |posture, second| match_features(&MatchParams::default(), posture, &once, second);
-        assert_eq!(matched(Posture::Any, &twice), []);
-        assert_eq!(matched(Posture::Level, &twice), (0..200).map(own).collect::<Vec<_>>());
-        // Not level after all.
-        assert_eq!(matched(Posture::Level, &far).len(), 200);
-        // What is on the ground may be turned anyhow.
-        let on_the_ground = |features: &ImageFeatures| {
-            let mut features = features.clone();
-            (features.width, features.height) = (100, 50);
-            for keypoint in &mut features.keypoints {
-                keypoint.y = 40.0;
-            }
-            features
-        };
-        let [once, twice] = [&once, &twice].map(on_the_ground);
-        assert_eq!(match_features(&MatchParams::default(), Posture::Level, &once, &twice), []);
+        Posture::of([&camera; 2])
     }
 
-    fn own(at: u32) -> Match {
-        Match { first: at, second: at }
+    /// The same descriptors once for each of these elevations in degrees, orientations and sizes in pixels.
+    fn seen(descriptors: &[u8], aspects: &[(f32, f32, f32)]) -> ImageFeatures {
+        let mut features = features(descriptors.repeat(aspects.len()));
+        let num_each = count(descriptors);
+        for (at, keypoint) in features.keypoints.iter_mut().enumerate() {
+            let (elevation, orientation, size) = aspects[at / num_each];
+            // Spots all round, some degrees up and down.
+            let row = 900.0 - 10.0 * (elevation + (at % num_each % 5) as f32 - 2.0);
+            *keypoint = Keypoint { y: row, size, ..*keypoint };
+            keypoint.orientation = orientation + (at % num_each) as f32 * 0.1;
+        }
+        features
+    }
+
+    /// What share of 1000 keypoints so seen matches first and second ones, in percent; nothing else does.
+    fn matched(posture: Posture, first: &[(f32, f32, f32)], second: &[(f32, f32, f32)]) -> usize {
+        let descriptors = random(&mut ChaCha8Rng::seed_from_u64(8), 1000);
+        let images = [first, second].map(|aspects| seen(&descriptors, aspects));
+        let found = match_features(&MatchParams::default(), posture, &images[0], &images[1]);
+        assert!(found.iter().all(|m| m.first % 1000 == m.second % 1000));
+        found.len() / 10
+    }
+
+    #[test]
+    fn keypoints_of_level_images_match_those_turned_alike() {
+        // Twice the place, the second time turned about: a repetition for all keypoints, none for those alike.
+        let (once, twice) = ([(30.0, 0.0, 8.0)], [(30.0, 0.6, 8.0), (30.0, 3.0, 8.0)]);
+        assert_eq!(matched(Posture::Any, &once, &twice), 0);
+        assert_eq!(matched(level(), &once, &twice), 100);
+        // Not level after all.
+        assert_eq!(matched(level(), &once, &[(30.0, 2.0, 8.0)]), 100);
+        // What is on the ground may be turned anyhow.
+        let below = |aspects: &[(f32, f32, f32)]| {
+            aspects.iter().map(|&(elevation, turn, size)| (-elevation, turn, size)).collect::<Vec<_>>()
+        };
+        assert_eq!(matched(level(), &below(&once), &below(&twice)), 0);
+    }
+
+    #[test]
+    fn keypoints_of_level_images_match_those_of_like_height_and_size() {
+        // Blocks that have both of what is told apart are compared with either, so not all can match.
+        // The same things above and below the camera.
+        let above = (30.0, 0.0, 8.0);
+        assert_eq!(matched(Posture::Any, &[above], &[above, (-30.0, 0.0, 8.0)]), 0);
+        assert!(matched(level(), &[above], &[above, (-30.0, 0.0, 8.0)]) > 90);
+        // The same things from farther off, half as high and as large (sin 30° ≈ 2 sin 14°), and much larger there.
+        let (farther, larger) = ((14.0, 0.0, 4.0), (14.0, 0.0, 40.0));
+        assert_eq!(matched(Posture::Any, &[above], &[farther, larger]), 0);
+        assert!(matched(level(), &[above], &[farther, larger]) > 60);
+    }
+
+    #[test]
+    fn elevations_of_crops_are_those_of_the_whole() {
+        let crop = Camera {
+            model: CameraModel::Equirectangular,
+            width: 3600,
+            height: 600,
+            params: vec![3600.0, 1800.0, 0.0, 500.0],
+        };
+        let elevations = Elevations::of(&crop).unwrap();
+        assert!((elevations.at(100.0).to_degrees() - 30.0).abs() < 1e-4);
+        assert!((elevations.at(700.0).to_degrees() + 30.0).abs() < 1e-4);
     }
 
     #[test]
@@ -457,7 +530,7 @@ mod tests {
         let first = features([&strong[..], &weak].concat());
         let same = features([&strong[..], &weak].concat());
         let other = features([&random(&mut rng, 50)[..], &weak].concat());
-        let params = MatchParams { screen_features: 25, screen_matches: 10, ..MatchParams::default() };
+        let params = MatchParams { screen_features: 12, screen_matches: 10, ..MatchParams::default() };
         assert_eq!(match_features(&params, Posture::Any, &first, &same).len(), 100);
         assert_eq!(match_features(&params, Posture::Any, &first, &other).len(), 0);
         let all = MatchParams { screen_features: 0, ..params };

@@ -1,6 +1,6 @@
 //! The walk over register tiles that the vector kernels share.
 
-use super::kernel::{Line, PackedBase, PackedQueries, Slots};
+use super::kernel::{BASE_BLOCK, Comparisons, Line, PackedBase, PackedQueries, QUERY_BLOCK, Slots};
 
 /// Base vectors per register tile.
 pub(super) const VECTORS: usize = 2;
@@ -51,7 +51,7 @@ pub(super) trait Lanes<const LANES: usize>: Copy {
     fn less(self, a: Self::Vector, b: Self::Vector) -> u32;
 }
 
-/// Updates the best two of all rows and, with `COLUMNS`, of all columns.
+/// Updates the best two of all rows and, with `COLUMNS`, of all columns, of those that are compared.
 #[inline(always)]
 pub(super) fn search<K, const ROWS: usize, const LANES: usize, const COLUMNS: bool>(
     kernel: K,
@@ -59,15 +59,22 @@ pub(super) fn search<K, const ROWS: usize, const LANES: usize, const COLUMNS: bo
     base: &PackedBase,
     rows: &mut Slots,
     columns: &mut Slots,
+    compared: impl Comparisons,
 ) where
     K: Instructions<ROWS, LANES>,
 {
+    const {
+        assert!(QUERY_BLOCK.is_multiple_of(ROWS) && BASE_BLOCK.is_multiple_of(LANES * VECTORS));
+    }
     let num_columns = base.terms.len();
     for tile in (0..num_columns).step_by(K::TILE) {
         let tile_end = (tile + K::TILE).min(num_columns);
         for row in (0..queries.terms.len()).step_by(ROWS) {
             let query_lines = &queries.lines[row * K::QUERY_LINES..(row + ROWS) * K::QUERY_LINES];
             for column in (tile..tile_end).step_by(LANES * VECTORS) {
+                if !compared.has(row, column) {
+                    continue;
+                }
                 let first = column / LANES * K::BASE_LINES;
                 let base_lines = &base.lines[first..first + VECTORS * K::BASE_LINES];
                 let products = kernel.multiply(query_lines, base_lines);
