@@ -25,6 +25,7 @@ mod structure;
 #[cfg(test)]
 mod test_street;
 mod told;
+mod triplets;
 pub(crate) mod wall;
 mod witnesses;
 
@@ -72,7 +73,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 40;
+pub const MAPPER_VERSION: u32 = 41;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -388,6 +389,8 @@ fn reconstruct_with(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -
     if let Some(standpoints) = Standpoints::find(params, input, seed) {
         return standpoints.expand(reconstruct_images(params, &standpoints.input(), seed));
     }
+    let pairs = triplets::consistent(input, seed);
+    let input = &MapperInput { pairs: &pairs, ..input.clone() };
     let output = reconstruct_images(params, input, seed);
     let Some(underfoot) = Underfoot::find(input) else { return output };
     let Some((rest, warning)) = underfoot.better_input(&output.components, seed) else { return output };

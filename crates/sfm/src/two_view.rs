@@ -1,12 +1,12 @@
 //! Verification of putative matches between two images on the sphere.
 
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 use setloc_features::{Match, Rays};
 
 use crate::{
     ImageId, Rigid,
-    robust::{RansacParams, estimate_relative_pose, estimate_rotation},
+    robust::{RansacParams, estimate_relative_pose, estimate_rotation, estimate_turned_pose},
 };
 
 /// Bumped when equal inputs and parameters give another geometry.
@@ -121,7 +121,7 @@ pub fn verify_pair(
     let mut found: Vec<TwoView> = Vec::new();
     while found.len() < params.max_geometries {
         let Some(view) =
-            verify_once(params, first, second, &remaining, seed.wrapping_add(found.len() as u64))
+            verify_once(params, first, second, &remaining, None, seed.wrapping_add(found.len() as u64))
         else {
             break;
         };
@@ -135,11 +135,23 @@ pub fn verify_pair(
     found
 }
 
+/// Verifies putative matches of which the rotation is known to a few degrees; `None` when too few agree.
+pub(crate) fn verify_turned(
+    params: &TwoViewParams,
+    [first, second]: [&Rays; 2],
+    matches: &[Match],
+    second_from_first: &UnitQuaternion<f64>,
+    seed: u64,
+) -> Option<TwoView> {
+    verify_once(params, first, second, matches, Some(second_from_first), seed)
+}
+
 fn verify_once(
     params: &TwoViewParams,
     first: &Rays,
     second: &Rays,
     matches: &[Match],
+    known: Option<&UnitQuaternion<f64>>,
     seed: u64,
 ) -> Option<TwoView> {
     if matches.len() < params.min_inliers {
@@ -157,14 +169,11 @@ fn verify_once(
         confidence: 0.999,
         ..RansacParams::default()
     };
-    let estimate = estimate_relative_pose(
-        &ransac,
-        &first_bearings,
-        &second_bearings,
-        &first_sigmas,
-        &second_sigmas,
-        seed,
-    )?;
+    let (bearings, sigmas) = ((&first_bearings, &second_bearings), (&first_sigmas, &second_sigmas));
+    let estimate = match known {
+        Some(turn) => estimate_turned_pose(&ransac, bearings.0, bearings.1, sigmas.0, sigmas.1, turn, seed)?,
+        None => estimate_relative_pose(&ransac, bearings.0, bearings.1, sigmas.0, sigmas.1, seed)?,
+    };
     if estimate.inliers.len() < params.min_inliers {
         return None;
     }

@@ -3,7 +3,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::absolute_pose::{cauchy_scale, turned};
 use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
-use super::ransac::{Consensus, RansacParams, distinct, lo_ransac};
+use super::ransac::{Consensus, Consented, RansacParams, distinct, lo_ransac};
 use super::residual::AngularResidual;
 use crate::Rigid;
 use crate::solvers::essential::{depth_signs, rotations_of_essential};
@@ -51,13 +51,24 @@ pub fn estimate_relative_pose(
     seed: u64,
 ) -> Option<RelativePoseEstimate> {
     let mut problem = RelativeConsensus::new(params, first, second, sigmas_first, sigmas_second)?;
-    let found = lo_ransac(params, &mut problem, seed)?;
-    Some(RelativePoseEstimate {
-        second_from_first: Rigid::from_matrix(&found.model.rotation, found.model.translation),
-        inliers: found.inliers,
-        score: found.score,
-        iterations: found.iterations,
-    })
+    Some(lo_ransac(params, &mut problem, seed)?.into())
+}
+
+/// [`estimate_relative_pose`] where the rotation is known to a few degrees: two-point LO-RANSAC of the direction of the
+/// translation. Refinement frees the rotation, too.
+pub(crate) fn estimate_turned_pose(
+    params: &RansacParams,
+    first: &[Vector3<f64>],
+    second: &[Vector3<f64>],
+    sigmas_first: &[f64],
+    sigmas_second: &[f64],
+    second_from_first: &UnitQuaternion<f64>,
+    seed: u64,
+) -> Option<RelativePoseEstimate> {
+    let data = RelativeConsensus::new(params, first, second, sigmas_first, sigmas_second)?;
+    let rotation = second_from_first.to_rotation_matrix().into_inner();
+    let found = lo_ransac(params, &mut TurnedConsensus { data, rotation }, seed)?;
+    Some(found.into())
 }
 
 /// Refines a relative pose by Levenberg–Marquardt with a Cauchy loss on the given pairs (all indices must be valid).
@@ -110,6 +121,17 @@ const PARALLEL_SIGMA: f64 = 3.0;
 struct SecondFromFirst {
     rotation: Matrix3<f64>,
     translation: Vector3<f64>,
+}
+
+impl From<Consented<SecondFromFirst>> for RelativePoseEstimate {
+    fn from(found: Consented<SecondFromFirst>) -> Self {
+        Self {
+            second_from_first: Rigid::from_matrix(&found.model.rotation, found.model.translation),
+            inliers: found.inliers,
+            score: found.score,
+            iterations: found.iterations,
+        }
+    }
 }
 
 struct RelativeConsensus<'a> {
@@ -281,6 +303,49 @@ fn sampson_derivative(
     let inverse = 1.0 / term.variance.sqrt();
     let ratio = term.error / term.variance;
     ((error_turn - variance_turn * ratio) * inverse, (error_shift - variance_shift * ratio) * inverse)
+}
+
+struct TurnedConsensus<'a> {
+    data: RelativeConsensus<'a>,
+    rotation: Matrix3<f64>,
+}
+
+impl Consensus for TurnedConsensus<'_> {
+    type Model = SecondFromFirst;
+
+    fn len(&self) -> usize {
+        self.data.len()
+    }
+
+    fn sample_size(&self) -> usize {
+        2
+    }
+
+    fn hypothesize(&mut self, rng: &mut ChaCha8Rng, models: &mut Vec<SecondFromFirst>) {
+        let sample = distinct::<2>(rng, self.len());
+        let rays = sample.map(|i| (self.rotation * self.data.first[i], self.data.second[i]));
+        // The translation lies in the plane of either pair of rays.
+        let [a, b] = rays.map(|(first, second)| first.cross(&second));
+        let Some(along) = a.cross(&b).try_normalize(1e-12) else { return };
+        for translation in [along, -along] {
+            let is_before = rays.iter().all(|(first, second)| {
+                let (near, far) = depth_signs(first, &translation, second);
+                near > 0.0 && far > 0.0
+            });
+            if is_before {
+                models.push(SecondFromFirst { rotation: self.rotation, translation });
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn squared_residual(&self, model: &SecondFromFirst, index: usize, bound: f64) -> f64 {
+        self.data.squared_residual(model, index, bound)
+    }
+
+    fn refine(&self, model: &SecondFromFirst, inliers: &[u32], max_steps: usize) -> SecondFromFirst {
+        self.data.refine(model, inliers, max_steps)
+    }
 }
 
 struct RotationConsensus<'a>(RelativeConsensus<'a>);
