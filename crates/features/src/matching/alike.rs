@@ -12,7 +12,7 @@ const SECTORS: usize = 16;
 /// Sectors beside a keypoint's own that it is compared with: what is up to 45° off always, beyond 67.5° never.
 const BESIDE: usize = 2;
 /// Octaves up to which keypoints differ in extent ([`Aspect::extent`]) that are compared. (Of the right matches of plaza,
-/// `small`, `lzr` and `street` 99.8–99.99 % are, and 95–99 % where one image is tilted by 20°.)
+/// `small`, `lzr` and `street` 99.8–99.98 % are, and 95–98 % where one image is tilted by 20°.)
 const OCTAVES: f32 = 1.5;
 /// Bright and as many dark keypoints of each image whose matches tell whether the two are level.
 pub(super) const SAMPLE: usize = 1024;
