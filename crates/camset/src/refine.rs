@@ -13,6 +13,7 @@ use setloc_sfm::{ImageId, Place, PointId, Rigid, WallSight};
 
 use crate::bearing_errors::HeldByScene;
 use crate::common::{CommonErrors, PoseError, shift_of_point};
+use crate::common_turn::CommonTurn;
 use crate::evidence::{PhotoRays, ray_error_sigmas};
 use crate::jackknife::honest_covariances;
 use crate::{Scene, SceneMatch};
@@ -287,8 +288,11 @@ pub(crate) fn refine_jointly(
     for (point, refined) in model.points.iter_mut().zip(&problem.points) {
         *point = refined.position;
     }
+    let turn =
+        if with_covariance { CommonTurn::of(scene, rays, &model.photos, &observed.direct) } else { None };
     let of_photo = |(slot, photo): (usize, &JointPhoto)| {
-        Some(turned(of_leads[photo.standpoint].as_ref()?, &standpoints.turn[slot]))
+        let own = turned(of_leads[photo.standpoint].as_ref()?, &standpoints.turn[slot]);
+        Some(turn.map_or(own, |turn| own + turn.covariance(&photo.world_from_camera)))
     };
     model.photos.iter().enumerate().map(of_photo).collect()
 }
