@@ -231,6 +231,16 @@ impl MapperInput<'_> {
     pub(crate) fn is_fixed(&self, camera: usize) -> bool {
         self.calibrations[camera].is_settled()
     }
+
+    /// The camera of an image.
+    pub(crate) fn camera_of(&self, image: ImageId) -> &Camera {
+        &self.cameras[self.images[image.index()].camera.index()]
+    }
+
+    /// Whether an image is a panorama.
+    pub(crate) fn is_panoramic(&self, image: ImageId) -> bool {
+        self.camera_of(image).is_panoramic()
+    }
 }
 
 /// All matches of two images, before verification.

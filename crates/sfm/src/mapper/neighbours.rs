@@ -46,11 +46,9 @@ pub(super) fn neighbours<'r>(
     counts: impl Fn(ImageId, ImageId) -> bool + Sync,
     max_error_sigma: f64,
 ) -> Vec<Neighbours> {
-    let is_panorama =
-        |image: ImageId| input.cameras[input.images[image.index()].camera.index()].is_panoramic();
     let pairs = input.putative.par_iter().with_max_len(8);
     pairs
-        .filter(|pair| [pair.first, pair.second].into_iter().all(is_panorama))
+        .filter(|pair| [pair.first, pair.second].into_iter().all(|image| input.is_panoramic(image)))
         .filter(|pair| counts(pair.first, pair.second))
         .filter_map(|pair| {
             let ((first, first_rays), (second, second_rays)) = (placed(pair.first)?, placed(pair.second)?);

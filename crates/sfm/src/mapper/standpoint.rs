@@ -332,7 +332,7 @@ fn candidate_turns<'a>(params: &MapperParams, input: &MapperInput<'a>) -> Vec<&'
         .filter(|pair| {
             let known = |image: ImageId| {
                 let camera = input.images[image.index()].camera.index();
-                input.is_fixed(camera) && !input.cameras[camera].is_panoramic()
+                input.is_fixed(camera) && !input.is_panoramic(image)
             };
             pair.two_view.kind == TwoViewKind::PureRotation
                 && pair.two_view.inliers.len() >= params.min_turn_matches
@@ -404,7 +404,7 @@ fn sees_the_overlap(
     rays: &[Rays],
 ) -> bool {
     let first = &input.images[pair.first.index()];
-    let second = &input.cameras[input.images[pair.second.index()].camera.index()];
+    let second = input.camera_of(pair.second);
     let bearings = &rays[pair.first.index()].bearings;
     let turn = pair.two_view.second_from_first.rotation;
     let shared =

@@ -80,11 +80,9 @@ struct Views(Vec<BTreeMap<ImageId, Vec<View>>>);
 
 impl Views {
     fn of(input: &MapperInput<'_>) -> Self {
-        let is_panoramic =
-            |image: ImageId| input.cameras[input.images[image.index()].camera.index()].is_panoramic();
         let mut views: Vec<BTreeMap<_, Vec<_>>> = input.images.iter().map(|_| BTreeMap::new()).collect();
         for PairGeometry { first, second, two_view } in input.pairs {
-            if is_panoramic(*first) && is_panoramic(*second) {
+            if input.is_panoramic(*first) && input.is_panoramic(*second) {
                 let (turn, matches) = (two_view.second_from_first.rotation, two_view.inliers.len());
                 for (from, to, second_from_first) in [(first, second, turn), (second, first, turn.inverse())]
                 {
