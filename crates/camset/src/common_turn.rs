@@ -81,6 +81,27 @@ mod tests {
 
     use super::*;
     use crate::jackknife::deviation;
+    use crate::synthetic::World;
+
+    #[test]
+    fn only_what_exceeds_the_stated_noise_turns_a_scene() {
+        let sigma = |more_noise: f32| {
+            let mut world = World::chain(1, 0.0, 35);
+            let matches = world.scene_matches(0);
+            for (at, found) in matches.iter().enumerate() {
+                let keypoint = &mut world.photos[0].features.keypoints[found.feature as usize];
+                let [x, y] = [[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]][at % 4];
+                keypoint.x += x * more_noise * keypoint.noise_px;
+                keypoint.y += y * more_noise * keypoint.noise_px;
+            }
+            let view = &world.photos[0];
+            let photo = JointPhoto { camera: 0, world_from_camera: view.pose, standpoint: 0 };
+            let rays = [PhotoRays::new(&view.features, &world.camera)];
+            CommonTurn::of(&world.scene(), &rays, &[photo], &[matches]).map_or(0.0, |turn| turn.sigma)
+        };
+        let (stated, noisy, noisier) = (sigma(0.0), sigma(1.5), sigma(3.0));
+        assert!(4.0 * stated < noisy && 1.5 * noisy < noisier, "{stated} {noisy} {noisier}");
+    }
 
     #[test]
     fn the_covariance_is_that_of_poses_turned_about_the_middle() {
