@@ -68,8 +68,9 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// them, and what is seen where a scene may be folded, are uncertain. 31: where a set's photos have many cameras, those
 /// that share one have focal lengths of their own. 32: a set's scale by the walls that its photos show. 33: errors that
 /// directions of the scene's images share. 34: and how these change the stretch of panoramas. 35: focal lengths that a
-/// set's photos contradict; walls by what is more alike. 36: what matches err alike.
-pub const VERSION: u32 = 36;
+/// set's photos contradict; walls by what is more alike. 36: what matches err alike. 37: wrong matches do not stand for the
+/// noise of right ones.
+pub const VERSION: u32 = 37;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

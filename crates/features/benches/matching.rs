@@ -7,7 +7,13 @@ use std::hint::black_box;
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
 use setloc_features::{DESCRIPTOR_LEN, ImageFeatures, MatchParams, Posture, match_features, two_nearest};
+
+/// Pairs of images that are matched at once.
+const PAIRS: u64 = 16;
+/// Keypoints of each of their images.
+const PAIR_FEATURES: usize = 4096;
 
 /// Descriptors of random directions with the stored norm, as RootSIFT's are.
 fn random_features(seed: u64, count: usize) -> ImageFeatures {
@@ -23,6 +29,21 @@ fn random_features(seed: u64, count: usize) -> ImageFeatures {
         descriptors,
         ..ImageFeatures::default()
     }
+}
+
+/// Two images of which every second keypoint of one is one of the other's, a little changed: they match, so all of them
+/// are compared.
+fn related_features(seed: u64, count: usize) -> (ImageFeatures, ImageFeatures) {
+    let first = random_features(seed, count);
+    let mut second = random_features(seed + 1, count);
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let descriptors = second.descriptors.chunks_exact_mut(DESCRIPTOR_LEN);
+    for (own, other) in descriptors.zip(first.descriptors.chunks_exact(DESCRIPTOR_LEN)).step_by(2) {
+        for (own, other) in own.iter_mut().zip(other) {
+            *own = other.saturating_add(rng.random_range(0..8));
+        }
+    }
+    (first, second)
 }
 
 /// The fastest u8 multiply-add loop this processor can run: independent accumulators, no memory.
@@ -99,9 +120,24 @@ fn matching(criterion: &mut Criterion) {
                 bencher.iter(|| two_nearest(black_box(&first), black_box(&second)));
             });
         }
+        let (first, second) = related_features(3, count);
+        let params = MatchParams::default();
+        assert!(match_features(&params, Posture::Any, &first, &second).len() > count / 4);
         group.bench_function(format!("match_features mutual {count}×{count}"), |bencher| {
-            let params = MatchParams::default();
             bencher.iter(|| match_features(&params, Posture::Any, black_box(&first), black_box(&second)));
+        });
+    }
+    // As a build does it: every pair on one thread, many pairs at once.
+    let pairs: Vec<_> = (0..PAIRS).map(|pair| related_features(10 + 2 * pair, PAIR_FEATURES)).collect();
+    group.throughput(Throughput::Elements(PAIRS * (PAIR_FEATURES * PAIR_FEATURES * DESCRIPTOR_LEN) as u64));
+    for threads in [1, 2] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+        group.bench_function(format!("{PAIRS} pairs of {PAIR_FEATURES}, {threads} threads"), |bencher| {
+            let params = MatchParams::default();
+            let matches = |(first, second): &(ImageFeatures, ImageFeatures)| {
+                match_features(&params, Posture::Any, first, second).len()
+            };
+            bencher.iter(|| pool.install(|| black_box(&pairs).par_iter().map(matches).sum::<usize>()));
         });
     }
     group.finish();

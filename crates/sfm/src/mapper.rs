@@ -9,6 +9,7 @@ mod correspondence;
 mod direction;
 mod divide;
 mod initial;
+mod latecomers;
 mod lens;
 mod merge;
 mod model;
@@ -50,9 +51,10 @@ use self::{
     continuation::{Continued, continue_planes},
     correspondence::CorrespondenceGraph,
     divide::divide,
+    latecomers::{FEW_IMAGES, Support, hypothesize_from_crossings},
     lens::choose_lenses,
     model::Model,
-    neighbours::{neighbours, share_as_neighbours},
+    neighbours::{Neighbours, neighbours, share_as_neighbours, share_with_one},
     projection::search_by_projection,
     register::{
         PoseHypothesis, Visibility, count_scene_matches, hypothesize, hypothesize_baseline,
@@ -73,7 +75,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 41;
+pub const MAPPER_VERSION: u32 = 42;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -439,7 +441,49 @@ fn map_parts(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> (Vec<
         }
         parts.push(mapper.into_part());
     }
-    (merge::join_supported(params, input, parts, &mut report, seed), report)
+    let parts = merge::join_supported(params, input, parts, &mut report, seed);
+    (admit_latecomers(params, input, parts, &mut report, seed), report)
+}
+
+/// The parts with the images that only their pairs and what they share with neighbours speak for, largest first.
+///
+/// Images of parts of hardly any images may leave them for a larger one. Only of panoramas is it known what neighbours
+/// share, so nothing changes without any.
+fn admit_latecomers(
+    params: &MapperParams,
+    input: &MapperInput<'_>,
+    mut parts: Vec<Part>,
+    report: &mut MapperReport,
+    seed: u64,
+) -> Vec<Part> {
+    if !(0..input.images.len() as u32).any(|image| input.is_panoramic(ImageId(image))) {
+        return parts;
+    }
+    let mut at = 0;
+    while at < parts.len() && parts[at].size() > FEW_IMAGES {
+        let is_open = |&other: &usize| other == at || parts[other].size() <= FEW_IMAGES;
+        let open: Vec<usize> = (0..parts.len()).filter(is_open).collect();
+        let taken = merge::taken_by_others(input, &parts, &open);
+        let part = &parts[at];
+        let mut mapper = Mapper::over(params, Model::open(input, &part.component, &taken), taken, seed);
+        mapper.anchors.clone_from(&part.anchors);
+        mapper.admits_latecomers = true;
+        mapper.grow();
+        report.registrations.append(&mut mapper.records);
+        if mapper.model.registered_count() > part.size() {
+            mapper.finish();
+            report.registrations.append(&mut mapper.records);
+            parts[at] = mapper.into_part();
+            let admitted: Vec<ImageId> = parts[at].component.registered().collect();
+            for (_, other) in parts.iter_mut().enumerate().filter(|(other, _)| *other != at) {
+                other.leave_out(&admitted);
+            }
+            parts.retain(|part| part.size() >= 2);
+        }
+        at += 1;
+    }
+    parts.sort_by_key(|part| Reverse(part.size()));
+    parts
 }
 
 /// The parts with what pairs add to them that they were not made of, largest first; witnesses judge who joins.
@@ -547,14 +591,19 @@ impl Part {
                 || self.component.lengths.iter().any(|length| length.involves(image))
         };
         let unheld: Vec<ImageId> = self.component.registered().filter(|image| !held(*image)).collect();
-        for image in &unheld {
+        self.leave_out(&unheld);
+        (self.component, unheld)
+    }
+
+    /// Takes the poses of images and what they see.
+    fn leave_out(&mut self, images: &[ImageId]) {
+        for image in images {
             self.component.images[image.index()].world_from_camera = None;
             for point in &mut self.component.points {
                 point.track.retain(|seen| seen.image != *image);
             }
         }
         self.component.points.retain(|point| point.track.len() >= 2);
-        (self.component, unheld)
     }
 }
 
@@ -609,6 +658,8 @@ struct Mapper<'a> {
     images_at_last_global: usize,
     /// What judges poses in place of what is in plain view, where a floor repeats itself.
     witnesses: Option<&'a Witnesses>,
+    /// Whether images come in that only their pairs and what they share with neighbours speak for.
+    admits_latecomers: bool,
     seed: u64,
 }
 
@@ -643,6 +694,7 @@ impl<'a> Mapper<'a> {
             planes_tried: BTreeMap::new(),
             records: Vec::new(),
             witnesses: None,
+            admits_latecomers: false,
             seed,
         }
     }
@@ -985,6 +1037,14 @@ impl<'a> Mapper<'a> {
             from_pairs.truncate(self.params.max_pose_hypotheses);
             self.first_accepted(image, from_pairs, &mut records)
         });
+        let pose = pose.or_else(|| {
+            let crossed = (self.admits_latecomers).then(|| {
+                hypothesize_from_crossings(&self.model, &self.graph, image, self.params.max_error_sigma)
+            })?;
+            // Two directions nearly always cross somewhere.
+            let pose = crossed.filter(|pose| self.is_latecomer(image, &pose.world_from_camera))?;
+            self.first_accepted(image, vec![pose], &mut records)
+        });
         (pose, records)
     }
 
@@ -1005,6 +1065,7 @@ impl<'a> Mapper<'a> {
                 None if judged => self.params.is_recognized(&seen),
                 None => !refused_before,
             };
+            let plausible = plausible || self.is_latecomer(image, &hypothesis.world_from_camera);
             refused_before |= !plausible;
             let accepted = plausible
                 && self.pair_agreement(image, &hypothesis.world_from_camera)
@@ -1029,22 +1090,41 @@ impl<'a> Mapper<'a> {
         Some(witnesses.hear(&self.model, image, world_from_camera, inliers, self.params.max_error_sigma))
     }
 
-    /// Whether an image shares with those next to it what neighbours do, by what these share with theirs.
-    fn shares_as_neighbour(&self, image: ImageId) -> bool {
+    /// Whether an image may come in late at a pose.
+    fn is_latecomer(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        self.admits_latecomers
+            && Support::of(&self.model, image, world_from_camera, self.params.max_error_sigma)
+                .is_enough(self.params.min_initial_points)
+            && {
+                let (known, asked) = self.neighbours_of(image, world_from_camera);
+                share_with_one(&known, &asked)
+            }
+    }
+
+    /// Whether an image shares with those next to a pose what neighbours do, by what these share with theirs.
+    fn shares_as_neighbour(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        let (known, asked) = self.neighbours_of(image, world_from_camera);
+        share_as_neighbours(&known, &asked)
+    }
+
+    /// The pairs of those next to a pose, and what an image there shares with them.
+    fn neighbours_of(&self, image: ImageId, world_from_camera: &Rigid) -> (Vec<Neighbours>, Vec<Neighbours>) {
         let model = &self.model;
         let mut is_near = vec![false; model.poses.len()];
         for other in model.registered_neighbours(image) {
             is_near[other.index()] = true;
         }
         let placed = |of: ImageId| {
-            let pose = model.poses[of.index()].as_ref()?.world_from_camera;
+            let pose = if of == image {
+                *world_from_camera
+            } else {
+                model.poses[of.index()].as_ref()?.world_from_camera
+            };
             Some((pose, &model.rays[of.index()]))
         };
         let counts = |first: ImageId, second: ImageId| is_near[first.index()] || is_near[second.index()];
         let pairs = neighbours(model.input, placed, counts, self.params.max_error_sigma);
-        let (asked, known): (Vec<_>, Vec<_>) =
-            pairs.into_iter().partition(|pair| pair.images.contains(&image));
-        share_as_neighbours(&known, &asked)
+        pairs.into_iter().partition(|pair| !pair.images.contains(&image))
     }
 
     /// Share of an image's verified matches to registered images that belong to pairs that agree with a pose.
@@ -1112,7 +1192,12 @@ impl<'a> Mapper<'a> {
             let judged = seen.expected >= self.params.min_visible_points;
             let is_misplaced = match self.testimony(image, &pose, &observations) {
                 Some(testimony) => testimony.speaks_against(),
-                None => judged && !self.params.is_recognized(&seen) && !self.shares_as_neighbour(image),
+                None => {
+                    judged
+                        && !self.params.is_recognized(&seen)
+                        && !self.shares_as_neighbour(image, &pose)
+                        && !self.is_latecomer(image, &pose)
+                }
             };
             is_misplaced.then_some((at, seen))
         };

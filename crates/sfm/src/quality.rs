@@ -393,13 +393,23 @@ impl QualityReport {
                 pair.expected
             ));
         }
-        for pair in &self.outvoted {
+        // Those that weigh most against what holds their sides together.
+        let mut heaviest: Vec<&OutvotedPair> = self.outvoted.iter().collect();
+        heaviest.sort_by(|a, b| b.weight().total_cmp(&a.weight()));
+        for pair in heaviest.iter().take(MOST_NAMED) {
             lines.push(format!(
                 "the {} matches of {} and {} contradict the model, which {} points hold together between them: it may be wrong there",
                 pair.matches,
                 name(pair.first),
                 name(pair.second),
                 pair.held_by
+            ));
+        }
+        if heaviest.len() > MOST_NAMED {
+            let others = heaviest.len() - MOST_NAMED;
+            lines.push(format!(
+                "{others} more {} with as few points between: it may be folded",
+                if others == 1 { "pair contradicts the model" } else { "pairs contradict the model" }
             ));
         }
         for (image, points) in &self.weak_images {
@@ -448,6 +458,28 @@ mod tests {
             camera: CameraId(0),
             world_from_camera: Some(Rigid::new(UnitQuaternion::identity(), Vector3::new(x, 0.0, 0.0))),
         }
+    }
+
+    #[test]
+    fn many_pairs_that_weigh_against_a_model_are_summed_up() {
+        let images: Vec<ReconstructionImage> = (0..8).map(|at| image("a.jpg", f64::from(at))).collect();
+        let model = Reconstruction { images, ..Reconstruction::default() };
+        let pair = |at: u32| OutvotedPair {
+            first: ImageId(at),
+            second: ImageId(at + 1),
+            matches: 100 + at as usize,
+            held_by: 60,
+            side: Vec::new(),
+        };
+        let sentences = |count: u32| {
+            let outvoted = (0..count).map(pair).collect();
+            QualityReport { outvoted, ..QualityReport::default() }.sentences(&model)
+        };
+        assert_eq!(sentences(5).len(), 5);
+        let seven = sentences(7);
+        assert_eq!(seven.len(), 6);
+        assert!(seven[0].starts_with("the 106 matches"), "{seven:?}");
+        assert!(seven[5].starts_with("2 more pairs contradict the model"), "{seven:?}");
     }
 
     #[test]

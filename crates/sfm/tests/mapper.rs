@@ -619,6 +619,83 @@ fn two_halves_that_only_few_matches_tie_become_one() {
     assert_eq!(output, on(1));
 }
 
+/// Panoramas along a corridor (x across, y down, z along), one in a door of it, and one in the room behind, which sees next
+/// to nothing that two others see as it does; all far down the corridor would be in its plain view but for the wall.
+#[test]
+fn a_room_behind_a_door_belongs_to_its_corridor() {
+    let mut rng = ChaCha8Rng::seed_from_u64(11);
+    let mut points: Vec<Vector3<f64>> = (0..1600)
+        .map(|_| {
+            let side = if rng.random_bool(0.5) { 1.2 } else { -1.2 };
+            Vector3::new(side, rng.random_range(-1.3..1.2), rng.random_range(-3.0..40.0))
+        })
+        .collect();
+    points.extend((0..500).map(|_| {
+        let (along, across) = (rng.random_range(16.0..20.0), rng.random_range(1.6..6.0));
+        let [x, z] = [[across, 16.0], [across, 20.0], [6.0, along]][rng.random_range(0..3)];
+        Vector3::new(x, rng.random_range(-1.3..1.2), z)
+    }));
+    // Nothing is seen through the wall but through the door.
+    let wall = 1.4;
+    let sees = |from: &Vector3<f64>, point: &Vector3<f64>| {
+        let share = (wall - from.x) / (point.x - from.x);
+        let at = from.z + share * (point.z - from.z);
+        !(0.0..=1.0).contains(&share) || (17.5..18.5).contains(&at)
+    };
+    let mut centers: Vec<Vector3<f64>> =
+        (0..10).map(|k| Vector3::new(rng.random_range(-0.3..0.3), 0.0, 4.0 * f64::from(k))).collect();
+    centers.extend([Vector3::new(wall + 0.1, 0.05, 18.0), Vector3::new(3.3, 0.0, 18.3)]);
+    let camera = Camera::equirectangular(3072, 1536);
+    let mut house = Street {
+        truth: vec![],
+        cameras: vec![],
+        names: vec![],
+        features: vec![],
+        point_of: vec![],
+        look: (0..points.len()).collect(),
+    };
+    for (index, center) in centers.into_iter().enumerate() {
+        let pose = Rigid::new(UnitQuaternion::from_euler_angles(0.01, 0.7 * index as f64, 0.02), center);
+        let mut features = ImageFeatures { width: 3072, height: 1536, ..ImageFeatures::default() };
+        let mut seen = Vec::new();
+        for (id, point) in points.iter().enumerate().filter(|(_, point)| sees(&center, point)) {
+            let pixel = camera.project(&pose.inverse_transform_point(point)).expect("sees all around");
+            let [x, y] = [pixel.x, pixel.y].map(|at| (at + rng.random_range(-0.5..0.5)) as f32);
+            features.keypoints.push(Keypoint { x, y, size: 5.0, orientation: 0.0, noise_px: 0.3 });
+            features.colors.push([128; 3]);
+            seen.push(id);
+        }
+        house.truth.push(pose);
+        house.cameras.push(camera.clone());
+        house.names.push(format!("image_{index:02}"));
+        house.features.push(features);
+        house.point_of.push(seen);
+    }
+    let pairs = house.verified_pairs(&house.cameras);
+    let putative: Vec<PutativePair> = pairs
+        .iter()
+        .map(|pair| PutativePair {
+            first: pair.first,
+            second: pair.second,
+            matches: pair.two_view.inliers.clone(),
+        })
+        .collect();
+    let input = MapperInput {
+        calibrations: vec![Calibration::Known],
+        cameras: vec![camera],
+        images: (0..house.features.len())
+            .map(|index| InputImage::new(&house.names[index], CameraId(0), &house.features[index]))
+            .collect(),
+        pairs: &pairs,
+        putative: &putative,
+        two_view: TwoViewParams::default(),
+    };
+    let output = reconstruct(&MapperParams::default(), &input, 5);
+    let (registered, worst_m, worst_deg) = house.errors(&output);
+    assert_eq!(registered, 12, "{:?}", output.report.registrations);
+    assert!(worst_m < 0.02 && worst_deg < 0.1, "{worst_m} m, {worst_deg}°");
+}
+
 #[test]
 fn wrong_matches_join_nothing() {
     let mut street = Street::of_panoramas(10, 0.3, 0, 22);

@@ -208,7 +208,7 @@ fn first_joined(
 }
 
 impl Part {
-    fn size(&self) -> usize {
+    pub(super) fn size(&self) -> usize {
         self.component.registered().count()
     }
 

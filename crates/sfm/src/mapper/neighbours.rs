@@ -29,6 +29,8 @@ const MIN_MATCHES: f64 = 40.0;
 /// Share of what neighbours ought to have in common that they must have. Of rendered streets right joins have 0.6 to 1.3 of
 /// it, joins in the wrong place up to 0.16.
 const MIN_SHARED: f64 = 0.4;
+/// The same for the one that an image shares most with.
+const MIN_SHARED_WITH_ONE: f64 = 0.5;
 
 /// Two panoramas that were matched with each other, at their poses.
 #[derive(Debug, Clone, Copy)]
@@ -72,6 +74,18 @@ pub(super) fn neighbours<'r>(
 /// Whether the pairs that stand as near as neighbours share as much as neighbours do, by what those share that are known.
 pub(super) fn share_as_neighbours(known: &[Neighbours], asked: &[Neighbours]) -> bool {
     shared(known, asked).is_some_and(|share| share >= MIN_SHARED)
+}
+
+/// Whether one of the pairs shares [`MIN_SHARED_WITH_ONE`] of what one of its distance ought to: a room behind a door shares
+/// as much with the door only.
+pub(super) fn share_with_one(known: &[Neighbours], asked: &[Neighbours]) -> bool {
+    let Some(typical) = typical_matches(known).filter(|matches| *matches >= MIN_MATCHES) else {
+        return false;
+    };
+    asked.iter().any(|pair| {
+        let ought = matches_at(known, pair.log_distance);
+        ought >= NEAR_SHARE * typical && pair.matches >= MIN_SHARED_WITH_ONE * ought
+    })
 }
 
 /// What the pairs share that stand as near as neighbours, relative to what they ought to; `None` where no pair stands so
@@ -146,6 +160,16 @@ mod tests {
     fn an_image_among_others_must_share_with_all_of_them() {
         let known = street(6, 200.0);
         assert!(!share_as_neighbours(&known, &[beyond(1.0, 200.0), beyond(0.5, 20.0), beyond(0.7, 10.0)]));
+    }
+
+    #[test]
+    fn a_room_shares_with_its_door_only() {
+        let known = street(6, 200.0);
+        let behind_walls = [beyond(0.5, 20.0), beyond(0.7, 10.0)];
+        assert!(share_with_one(&known, &[[beyond(1.0, 120.0)].as_slice(), &behind_walls].concat()));
+        assert!(!share_with_one(&known, &[[beyond(1.0, 60.0)].as_slice(), &behind_walls].concat()));
+        // Far apart, even much means nothing.
+        assert!(!share_with_one(&known, &[beyond(2.0, 500.0)]));
     }
 
     #[test]
