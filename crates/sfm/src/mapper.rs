@@ -69,7 +69,7 @@ use self::{
 };
 use crate::{
     BaselineLength, CameraId, Georegistration, ImageId, Observation, OutvotedPair, PairGeometry, PointId,
-    Reconstruction, Rigid, TwoViewKind, TwoViewParams,
+    Reconstruction, ReconstructionImage, Rigid, TwoViewKind, TwoViewParams,
     bundle::{BundleParams, RobustLoss},
     robust::RansacParams,
 };
@@ -465,6 +465,12 @@ fn admit_latecomers(
         let open: Vec<usize> = (0..parts.len()).filter(is_open).collect();
         let taken = merge::taken_by_others(input, &parts, &open);
         let part = &parts[at];
+        let waits =
+            |(image, taken): (&ReconstructionImage, &bool)| image.world_from_camera.is_none() && !taken;
+        if !part.component.images.iter().zip(&taken).any(waits) {
+            at += 1;
+            continue;
+        }
         let mut mapper = Mapper::over(params, Model::open(input, &part.component, &taken), taken, seed);
         mapper.anchors.clone_from(&part.anchors);
         mapper.admits_latecomers = true;
@@ -1039,7 +1045,8 @@ impl<'a> Mapper<'a> {
         });
         let pose = pose.or_else(|| {
             let crossed = (self.admits_latecomers).then(|| {
-                hypothesize_from_crossings(&self.model, &self.graph, image, self.params.max_error_sigma)
+                let sigmas = self.params.max_error_sigma;
+                hypothesize_from_crossings(&self.model, &self.graph, &self.taken, image, sigmas)
             })?;
             // Two directions nearly always cross somewhere.
             let pose = crossed.filter(|pose| self.is_latecomer(image, &pose.world_from_camera))?;
@@ -1093,7 +1100,7 @@ impl<'a> Mapper<'a> {
     /// Whether an image may come in late at a pose.
     fn is_latecomer(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
         self.admits_latecomers
-            && Support::of(&self.model, image, world_from_camera, self.params.max_error_sigma)
+            && Support::of(&self.model, &self.taken, image, world_from_camera, self.params.max_error_sigma)
                 .is_enough(self.params.min_initial_points)
             && {
                 let (known, asked) = self.neighbours_of(image, world_from_camera);

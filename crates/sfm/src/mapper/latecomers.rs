@@ -30,7 +30,8 @@ const MIN_CROSSING_RAD: f64 = 0.1;
 const MIN_FOR: f64 = 0.8;
 /// Pairs that have to be for a pose.
 const MIN_PAIRS_FOR: usize = 2;
-/// How many times more matches the pairs for a pose must have than the strongest pair against it.
+/// How many times more matches the pairs for a pose must have than the strongest pair against it, and how many times fewer they
+/// may have than the strongest pair with an image that waits: that of a room with another panorama of the room.
 const LEAD: usize = 2;
 
 /// What the verified pairs of an image say of a pose.
@@ -40,18 +41,28 @@ pub(super) struct Support {
     pub pairs: usize,
     /// Matches of these.
     pub matches: usize,
-    /// Matches of the strongest pair that is not for it, with images outside the model, too.
+    /// Matches of the strongest pair that is not for it, of those with images of the model and of other large parts.
     pub against: usize,
+    /// Matches of the strongest pair with an image that waits, too, and says nothing yet.
+    pub waiting: usize,
 }
 
 impl Support {
     /// Whether that is enough to take it.
     pub fn is_enough(&self, min_matches: usize) -> bool {
-        self.pairs >= MIN_PAIRS_FOR && self.matches >= min_matches.max(LEAD * self.against)
+        let asked = (LEAD * self.against).max(self.waiting / LEAD);
+        self.pairs >= MIN_PAIRS_FOR && self.matches >= min_matches.max(asked)
     }
 
-    /// Asks all pairs of an image. Of the geometries of one pair, that which agrees best speaks for it.
-    pub fn of(model: &Model<'_>, image: ImageId, world_from_camera: &Rigid, max_error_sigma: f64) -> Self {
+    /// Asks all pairs of an image; `taken` are the images of other large parts. Of the geometries of one pair, that which
+    /// agrees best speaks for it.
+    pub fn of(
+        model: &Model<'_>,
+        taken: &[bool],
+        image: ImageId,
+        world_from_camera: &Rigid,
+        max_error_sigma: f64,
+    ) -> Self {
         let mut by_partner = BTreeMap::new();
         for pair in model.input.pairs {
             let Some((other, _)) = pair.seen_from(image) else { continue };
@@ -69,13 +80,15 @@ impl Support {
             let most: &mut usize = if agrees { speaks_for } else { speaks_against };
             *most = matches.max(*most);
         }
-        let mut support = Self { pairs: 0, matches: 0, against: 0 };
-        for (speaks_for, speaks_against) in by_partner.into_values() {
+        let mut support = Self { pairs: 0, matches: 0, against: 0, waiting: 0 };
+        for (partner, (speaks_for, speaks_against)) in by_partner {
             if speaks_for > 0 {
                 support.pairs += 1;
                 support.matches += speaks_for;
-            } else {
+            } else if model.is_registered(partner) || taken[partner.index()] {
                 support.against = support.against.max(speaks_against);
+            } else {
+                support.waiting = support.waiting.max(speaks_against);
             }
         }
         support
@@ -98,6 +111,7 @@ struct Edge {
 pub(super) fn hypothesize_from_crossings(
     model: &Model<'_>,
     graph: &CorrespondenceGraph,
+    taken: &[bool],
     image: ImageId,
     max_error_sigma: f64,
 ) -> Option<PoseHypothesis> {
@@ -118,7 +132,7 @@ pub(super) fn hypothesize_from_crossings(
     for (at, first) in edges.iter().enumerate() {
         for second in edges.iter().skip(at + 1).filter(|second| second.other != first.other) {
             let Some(pose) = crossing(first, second) else { continue };
-            let matches = Support::of(model, image, &pose, max_error_sigma).matches;
+            let matches = Support::of(model, taken, image, &pose, max_error_sigma).matches;
             if best.is_none_or(|(most, _)| matches > most) {
                 best = Some((matches, pose));
             }
@@ -197,8 +211,10 @@ mod tests {
 
     #[test]
     fn one_pair_or_a_strong_contradiction_is_not_enough() {
-        let enough = |pairs, matches, against| Support { pairs, matches, against }.is_enough(50);
-        assert!(enough(2, 300, 150));
-        assert!(!enough(1, 300, 0) && !enough(2, 300, 160) && !enough(2, 49, 0));
+        let enough =
+            |pairs, matches, against, waiting| Support { pairs, matches, against, waiting }.is_enough(50);
+        assert!(enough(2, 300, 150, 0) && enough(2, 300, 0, 600));
+        assert!(!enough(1, 300, 0, 0) && !enough(2, 49, 0, 0));
+        assert!(!enough(2, 300, 160, 0) && !enough(2, 300, 0, 700));
     }
 }
