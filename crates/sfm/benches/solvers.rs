@@ -117,6 +117,15 @@ fn minimal(criterion: &mut Criterion) {
             (found.len(), similarity_found(&found, truth))
         });
     }
+    let one_point = |rng: &mut ChaCha8Rng| {
+        let mut problem = GeneralizedProblem::exact(rng, &[0, 1, 2, 3], false);
+        problem.see_one_point(0, 1);
+        (problem.sample(), problem.world_from_set)
+    };
+    solver(criterion, "gp4ps, two rays at one point", one_point, |(origins, directions, points), truth| {
+        let found = gp4ps(origins, directions, points);
+        (found.len(), similarity_found(&found, truth))
+    });
     let unscaled = |rng: &mut ChaCha8Rng| {
         let ((origins, directions, points), truth) = generalized(rng, [0, 1, 2], false);
         let pose = Rigid::new(truth.rotation, truth.translation);

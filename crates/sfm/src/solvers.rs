@@ -7,6 +7,7 @@ mod dlt;
 mod five_point;
 mod gp3p;
 mod gp4ps;
+mod gp4ps_at_one_point;
 mod null_space;
 mod p3p;
 mod p4pf;

@@ -184,6 +184,13 @@ impl GeneralizedProblem {
         Self { world_from_set, rays, points, outlier }
     }
 
+    /// Turns the ray `second` to the point of the ray `first`, which both then see.
+    pub fn see_one_point(&mut self, first: usize, second: usize) {
+        self.points[second] = self.points[first];
+        let in_set = self.world_from_set.inverse().transform_point(&self.points[first]);
+        self.rays[second].direction = (in_set - self.rays[second].origin).normalize();
+    }
+
     /// Adds noise of `sigma` radians per axis and replaces a fraction of the directions by random ones.
     ///
     /// The wrong rays are spread over the list, and so over the cameras.
