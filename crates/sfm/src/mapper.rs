@@ -65,7 +65,7 @@ use self::{
     stitching::measure_stitching,
     structure::{PointLimits, complete_and_merge, filter, triangulate_image, triangulate_match},
     told::correct_told,
-    witnesses::{Testimony, Witnesses, count_on_circles},
+    witnesses::{Testimony, Witnesses, count_agreeing},
 };
 use crate::{
     BaselineLength, CameraId, Georegistration, ImageId, Observation, OutvotedPair, PairGeometry, PointId,
@@ -475,10 +475,12 @@ fn admit_latecomers(
         mapper.anchors.clone_from(&part.anchors);
         mapper.admits_latecomers = true;
         mapper.grow();
-        report.registrations.append(&mut mapper.records);
-        if mapper.model.registered_count() > part.size() {
+        let has_grown = mapper.model.registered_count() > part.size();
+        if has_grown {
             mapper.finish();
-            report.registrations.append(&mut mapper.records);
+        }
+        report.registrations.append(&mut mapper.records);
+        if has_grown {
             parts[at] = mapper.into_part();
             let admitted: Vec<ImageId> = parts[at].component.registered().collect();
             for (_, other) in parts.iter_mut().enumerate().filter(|(other, _)| *other != at) {
@@ -1153,11 +1155,8 @@ impl<'a> Mapper<'a> {
             all += matches;
             let deviation = image_from_other.rotation.angle_to(&measured.rotation);
             let agrees = deviation.to_degrees() <= self.params.max_pair_rotation_deg || {
-                let is_first = pair.first == image;
-                let second_from_first = if is_first { image_from_other.inverse() } else { image_from_other };
-                let rays = [pair.first, pair.second].map(|image| &self.model.rays[image.index()]);
                 let sigmas = self.params.max_error_sigma;
-                let on_circles = count_on_circles(rays, &second_from_first, &pair.two_view.inliers, sigmas);
+                let on_circles = count_agreeing(&self.model, pair, image, &image_from_other, sigmas);
                 on_circles as f64 >= MIN_ON_CIRCLES * matches as f64
             };
             if agrees {

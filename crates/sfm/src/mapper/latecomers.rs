@@ -14,7 +14,7 @@ use super::{
     correspondence::CorrespondenceGraph,
     model::Model,
     register::{PoseHypothesis, scene_matches, visibility},
-    witnesses::count_on_circles,
+    witnesses::count_agreeing,
 };
 use crate::{ImageId, PairGeometry, PointId, Rigid, TwoViewKind, solvers::triangulation::length_along};
 
@@ -69,11 +69,7 @@ impl Support {
             let matches = pair.two_view.inliers.len();
             let agrees = model.poses[other.index()].as_ref().is_some_and(|pose| {
                 let image_from_other = world_from_camera.inverse() * pose.world_from_camera;
-                let second_from_first =
-                    if pair.first == image { image_from_other.inverse() } else { image_from_other };
-                let rays = [pair.first, pair.second].map(|image| &model.rays[image.index()]);
-                let agreeing =
-                    count_on_circles(rays, &second_from_first, &pair.two_view.inliers, max_error_sigma);
+                let agreeing = count_agreeing(model, pair, image, &image_from_other, max_error_sigma);
                 agreeing as f64 >= MIN_FOR * matches as f64
             });
             let (speaks_for, speaks_against) = by_partner.entry(other).or_insert((0, 0));

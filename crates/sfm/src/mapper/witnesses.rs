@@ -43,6 +43,20 @@ pub(super) fn count_on_circles(
     on_circles(rays, second_from_first, matches, max_error_sigma).count()
 }
 
+/// How many of a pair's verified matches lie on the epipolar circles of a pose of `image`, one of the two, relative to the
+/// other.
+pub(super) fn count_agreeing(
+    model: &Model<'_>,
+    pair: &PairGeometry,
+    image: ImageId,
+    image_from_other: &Rigid,
+    max_error_sigma: f64,
+) -> usize {
+    let second_from_first = if pair.first == image { image_from_other.inverse() } else { *image_from_other };
+    let rays = [pair.first, pair.second].map(|image| &model.rays[image.index()]);
+    count_on_circles(rays, &second_from_first, &pair.two_view.inliers, max_error_sigma)
+}
+
 /// The verified matches of images away from what repeats itself, geometry by geometry.
 ///
 /// Where a floor repeats itself, most of what is in plain view of a right pose does not match, and much of what is not
