@@ -41,6 +41,10 @@ pub struct FeatureParams {
     /// street differ by far more. Squeezing one of the two photos makes up for it (J.-M. Morel, G. Yu, "ASIFT: A new
     /// framework for fully affine invariant image comparison", SIAM J. Imaging Sciences 2009). A tilt of 2 is 60°.
     pub simulated_tilt: f64,
+    /// The same for images with fewer than `min_features` keypoints of the usual contrast, where it is the larger.
+    ///
+    /// Rooms are small and bare: what two panoramas share of them they see from directions far apart, and any match counts.
+    pub faint_tilt: f64,
 }
 
 impl FeatureParams {
@@ -49,7 +53,8 @@ impl FeatureParams {
     /// 1: OpenCV SIFT, RootSIFT u8, half-pixel corrected, seam padded, spread over the sphere.
     /// 2: own SIFT, bright and dark spots apart. 3: simulated views. 4: large simulated views without their finest points.
     /// 5: weaker keypoints where there are few. 6: keypoints end at most five pixels from where they begin to be sought.
-    pub const VERSION: u32 = 6;
+    /// 7: simulated views where there are few.
+    pub const VERSION: u32 = 7;
 
     /// Checks the ranges.
     ///
@@ -76,7 +81,8 @@ impl FeatureParams {
             (0.0..=90.0).contains(&self.nadir_cone_deg),
         )?;
         let in_range = (1.0..=8.0).contains(&self.simulated_tilt);
-        check("simulated_tilt", self.simulated_tilt, "in [1, 8]", in_range)
+        check("simulated_tilt", self.simulated_tilt, "in [1, 8]", in_range)?;
+        check("faint_tilt", self.faint_tilt, "in [1, 8]", (1.0..=8.0).contains(&self.faint_tilt))
     }
 }
 
@@ -93,6 +99,7 @@ impl Default for FeatureParams {
             even_share: 0.6,
             nadir_cone_deg: 0.0,
             simulated_tilt: 1.0,
+            faint_tilt: 2.0,
         }
     }
 }
@@ -147,14 +154,17 @@ pub fn extract(
     let grey = grey.wrapped(padding);
     let source = Source { params, image, camera, mask, offset_x: padding as f32 * scale[0], scale };
     let mut features = ImageFeatures { width, height, ..ImageFeatures::default() };
-    features.light = source.append_view(&grey, [1.0, 1.0], params.max_features, &mut features);
-    if params.simulated_tilt > 1.0 {
-        for tilt in [[params.simulated_tilt, 1.0], [1.0, params.simulated_tilt]] {
+    let (light, usual) = source.append_view(&grey, [1.0, 1.0], params.max_features, &mut features);
+    features.light = light;
+    let is_faint = usual < params.min_features.min(params.max_features);
+    let tilt = if is_faint { params.simulated_tilt.max(params.faint_tilt) } else { params.simulated_tilt };
+    if tilt > 1.0 {
+        for tilt in [[tilt, 1.0], [1.0, tilt]] {
             let squeezed = grey.resized(tilt.map(f64::recip))?;
             let factor =
                 [grey.width as f32 / squeezed.width as f32, grey.height as f32 / squeezed.height as f32];
             let start = features.len() as u32;
-            let light = source.append_view(&squeezed, factor, params.max_features / 2, &mut features);
+            let (light, _) = source.append_view(&squeezed, factor, params.max_features / 2, &mut features);
             features.simulated.push(SimulatedView { start, light });
         }
     }
@@ -175,8 +185,14 @@ struct Source<'a> {
 
 impl Source<'_> {
     /// Detects in one view, `factor` grey pixels per pixel of the view, and appends at most `budget` keypoints. Returns
-    /// how many of them are light.
-    fn append_view(&self, view: &Grey, factor: [f32; 2], budget: usize, features: &mut ImageFeatures) -> u32 {
+    /// how many of them are light, and how many there are of the usual contrast, chosen or not.
+    fn append_view(
+        &self,
+        view: &Grey,
+        factor: [f32; 2],
+        budget: usize,
+        features: &mut ImageFeatures,
+    ) -> (u32, usize) {
         let Self { params, image, camera, .. } = self;
         let (width, height) = (image.width, image.height);
         // In proportion to what the view may have at most.
@@ -205,6 +221,7 @@ impl Source<'_> {
                 && self.mask.is_none_or(|mask| mask.allows(x, y, width, height))
                 && nadir.is_none_or(|limit| ray().is_none_or(|ray| ray.y < limit))
         };
+        let mut usual_count = 0;
         let choose = |points: &[SiftPoint]| {
             let candidate = |(index, point): (usize, &SiftPoint)| {
                 let (x, y) = in_image(point.x, point.y);
@@ -220,6 +237,7 @@ impl Source<'_> {
                     .then(a.index.cmp(&b.index))
             });
             let (usual, weaker) = candidates.split_at(candidates.partition_point(is_usual));
+            usual_count = usual.len();
             let mut chosen = choose(budget, params.even_share, camera, usual);
             chosen.extend(choose(fewest.saturating_sub(usual.len()), params.even_share, camera, weaker));
             chosen.sort_by_key(|candidate| !candidate.is_light);
@@ -241,7 +259,7 @@ impl Source<'_> {
             });
             push_root_sift(descriptor, &mut features.descriptors);
         }
-        points.iter().filter(|point| point.is_light).count() as u32
+        (points.iter().filter(|point| point.is_light).count() as u32, usual_count)
     }
 }
 
@@ -499,7 +517,7 @@ mod tests {
             *value += clear - 60;
         }
         let found = |min_features| {
-            let params = FeatureParams { min_features, ..FeatureParams::default() };
+            let params = FeatureParams { min_features, faint_tilt: 1.0, ..FeatureParams::default() };
             extract(&params, &image, &photo(240, 200), None).unwrap()
         };
         let (without, with) = (found(0), found(4096));
@@ -518,7 +536,7 @@ mod tests {
     #[test]
     fn keypoints_of_simulated_views_lie_where_the_blobs_are() {
         let centers = [[60.5, 70.5], [130.3, 60.8], [90.75, 140.25], [170.0, 150.0]];
-        let params = FeatureParams { simulated_tilt: 1.5, ..FeatureParams::default() };
+        let params = FeatureParams { simulated_tilt: 1.5, faint_tilt: 1.0, ..FeatureParams::default() };
         let features = extract(&params, &blobs(240, 200, &centers), &photo(240, 200), None).unwrap();
         assert_eq!(features.simulated.len(), 2);
         for view in features.simulated_parts() {
@@ -528,6 +546,16 @@ mod tests {
                 assert!(nearest(&of_view, center) < 0.2, "{center:?}: {}", nearest(&of_view, center));
             }
         }
+    }
+
+    #[test]
+    fn oblique_views_are_simulated_where_keypoints_are_few() {
+        let image = blobs(240, 200, &[[60.5, 70.5], [130.3, 60.8], [90.75, 140.25], [170.0, 150.0]]);
+        let views =
+            |params: FeatureParams| extract(&params, &image, &photo(240, 200), None).unwrap().simulated.len();
+        let of_min = |min_features| views(FeatureParams { min_features, ..FeatureParams::default() });
+        assert_eq!([of_min(0), of_min(4), of_min(4096)], [0, 0, 2]);
+        assert_eq!(views(FeatureParams { faint_tilt: 1.0, ..FeatureParams::default() }), 0);
     }
 
     #[test]
@@ -544,7 +572,7 @@ mod tests {
             .collect();
         let slanted = DecodedImage::from_rgb(300, 300, slanted).unwrap();
         let right = |simulated_tilt: f64| {
-            let params = FeatureParams { simulated_tilt, ..FeatureParams::default() };
+            let params = FeatureParams { simulated_tilt, faint_tilt: 1.0, ..FeatureParams::default() };
             let first = extract(&params, &straight, &photo(900, 300), None).unwrap();
             let second = extract(&params, &slanted, &photo(300, 300), None).unwrap();
             let matches = match_features(&MatchParams::default(), Posture::Any, &first, &second);
@@ -573,7 +601,8 @@ mod tests {
         for x in [0.3, 3.0, 399.9, 200.0] {
             let image = blobs(400, 200, &[[x, 100.0]]);
             let camera = Camera::equirectangular(400, 200);
-            let features = extract(&FeatureParams::default(), &image, &camera, None).unwrap();
+            let params = FeatureParams { faint_tilt: 1.0, ..FeatureParams::default() };
+            let features = extract(&params, &image, &camera, None).unwrap();
             let mut places: Vec<_> =
                 features.keypoints.iter().map(|k| (k.x.to_bits(), k.y.to_bits())).collect();
             places.dedup();

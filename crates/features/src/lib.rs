@@ -33,7 +33,9 @@
 //! let info = ImageInfo { width: 256, height: 128, metadata: image.metadata.clone() };
 //! let (camera, source) = guess_camera(&info);
 //! assert_eq!(source.to_string(), "panorama by its 2:1 aspect ratio");
-//! let features = extract(&FeatureParams::default(), &image, &camera, None)?;
+//! // Without the oblique views that are simulated where keypoints are few.
+//! let params = FeatureParams { faint_tilt: 1.0, ..FeatureParams::default() };
+//! let features = extract(&params, &image, &camera, None)?;
 //! let rays = features.rays(&camera);
 //! assert_eq!(rays.bearings.len(), features.len());
 //! let matches = match_features(&MatchParams::default(), Posture::of([&camera; 2]), &features, &features);

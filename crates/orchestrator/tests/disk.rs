@@ -34,7 +34,7 @@ fn a_full_disk_is_named_and_after_making_space_the_build_goes_on() {
     let folder = tempfile::tempdir().unwrap();
     town(folder.path());
     let script = "build; echo SPACE >&2; mount -o remount,size=200m store; build";
-    let Some(output) = with_small_disk(folder.path(), "700k", script) else { return };
+    let Some(output) = with_small_disk(folder.path(), "1600k", script) else { return };
     let text = said(&output);
     let (full, after) = text.split_once("SPACE").unwrap();
     assert!(full.contains("error: cannot write store/") && full.contains("No space left"), "{text}");

@@ -23,6 +23,7 @@ mod sides;
 mod standpoint;
 mod stitching;
 mod structure;
+mod support;
 #[cfg(test)]
 mod test_street;
 mod told;
@@ -51,7 +52,7 @@ use self::{
     continuation::{Continued, continue_planes},
     correspondence::CorrespondenceGraph,
     divide::divide,
-    latecomers::{FEW_IMAGES, Support, hypothesize_from_crossings},
+    latecomers::{FEW_IMAGES, hypothesize_from_crossings},
     lens::choose_lenses,
     model::Model,
     neighbours::{Neighbours, neighbours, share_as_neighbours, share_with_one},
@@ -64,6 +65,7 @@ use self::{
     standpoint::Standpoints,
     stitching::measure_stitching,
     structure::{PointLimits, complete_and_merge, filter, triangulate_image, triangulate_match},
+    support::Support,
     told::correct_told,
     witnesses::{Testimony, Witnesses, count_agreeing},
 };
@@ -75,7 +77,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 42;
+pub const MAPPER_VERSION: u32 = 43;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -842,7 +844,7 @@ impl<'a> Mapper<'a> {
         let mut found = found.into_iter();
         let mut records = Vec::new();
         let accepted = found.by_ref().find_map(|(edge, pose)| {
-            Some((edge.image, self.first_accepted(edge.image, vec![pose], &mut records)?))
+            Some((edge.image, self.first_accepted(edge.image, vec![pose], &mut false, &mut records)?))
         });
         self.records.append(&mut records);
         // Those that were not looked at come again.
@@ -881,7 +883,7 @@ impl<'a> Mapper<'a> {
             let visibility = visibility(&self.model, to, &world_from_camera, &[]);
             let hypothesis =
                 PoseHypothesis { world_from_camera, inliers: Vec::new(), candidates: votes, visibility };
-            Some((self.first_accepted(to, vec![hypothesis], &mut records)?, continued))
+            Some((self.first_accepted(to, vec![hypothesis], &mut false, &mut records)?, continued))
         });
         self.records.append(&mut records);
         for (pair, _) in found {
@@ -1031,11 +1033,12 @@ impl<'a> Mapper<'a> {
     /// A pose that may be taken, and what was thought of it and those before.
     fn acceptable_pose(&self, image: ImageId) -> (Option<PoseHypothesis>, Vec<RegistrationRecord>) {
         let mut records = Vec::new();
+        let mut has_rival = false;
         let seed = self.seed ^ (u64::from(image.0) << 32);
         let ransac = self.params.ransac();
         let resected =
             hypothesize(&self.model, &self.graph, image, &ransac, self.params.max_pose_hypotheses, seed);
-        let pose = self.first_accepted(image, resected, &mut records).or_else(|| {
+        let pose = self.first_accepted(image, resected, &mut has_rival, &mut records).or_else(|| {
             let confirmed = RansacParams { min_inliers: self.params.min_confirmed_inliers, ..ransac };
             let mut from_pairs = hypothesize_from_pairs(&self.model, &self.graph, image, &confirmed);
             from_pairs.retain(|pose| {
@@ -1043,7 +1046,7 @@ impl<'a> Mapper<'a> {
                     || pose.inliers.len() >= self.params.min_registration_inliers
             });
             from_pairs.truncate(self.params.max_pose_hypotheses);
-            self.first_accepted(image, from_pairs, &mut records)
+            self.first_accepted(image, from_pairs, &mut has_rival, &mut records)
         });
         let pose = pose.or_else(|| {
             let crossed = (self.admits_latecomers).then(|| {
@@ -1052,15 +1055,17 @@ impl<'a> Mapper<'a> {
             })?;
             // Two directions nearly always cross somewhere.
             let pose = crossed.filter(|pose| self.is_latecomer(image, &pose.world_from_camera))?;
-            self.first_accepted(image, vec![pose], &mut records)
+            self.first_accepted(image, vec![pose], &mut has_rival, &mut records)
         });
         (pose, records)
     }
 
+    /// The first of these that may be taken; `has_rival` tells whether pairs clearly spoke for one that was refused.
     fn first_accepted(
         &self,
         image: ImageId,
         hypotheses: Vec<PoseHypothesis>,
+        has_rival: &mut bool,
         records: &mut Vec<RegistrationRecord>,
     ) -> Option<PoseHypothesis> {
         let mut refused_before = false;
@@ -1076,7 +1081,15 @@ impl<'a> Mapper<'a> {
             };
             let plausible = plausible || self.is_latecomer(image, &hypothesis.world_from_camera);
             refused_before |= !plausible;
+            let is_contradicted = self.model.input.is_panoramic(image) && {
+                let support = self.support(image, &hypothesis.world_from_camera);
+                let is_contradicted =
+                    support.is_untenable() || (*has_rival || !judged) && support.is_contradicted();
+                *has_rival |= support.is_clear();
+                is_contradicted
+            };
             let accepted = plausible
+                && !is_contradicted
                 && self.pair_agreement(image, &hypothesis.world_from_camera)
                     >= self.params.min_pair_agreement;
             let (candidates, inliers) = (hypothesis.candidates, hypothesis.inliers.len());
@@ -1099,11 +1112,15 @@ impl<'a> Mapper<'a> {
         Some(witnesses.hear(&self.model, image, world_from_camera, inliers, self.params.max_error_sigma))
     }
 
+    /// What the verified pairs of an image say of a pose.
+    fn support(&self, image: ImageId, world_from_camera: &Rigid) -> Support {
+        Support::of(&self.model, &self.taken, image, world_from_camera, self.params.max_error_sigma)
+    }
+
     /// Whether an image may come in late at a pose.
     fn is_latecomer(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
         self.admits_latecomers
-            && Support::of(&self.model, &self.taken, image, world_from_camera, self.params.max_error_sigma)
-                .is_enough(self.params.min_initial_points)
+            && self.support(image, world_from_camera).is_enough(self.params.min_initial_points)
             && {
                 let (known, asked) = self.neighbours_of(image, world_from_camera);
                 share_with_one(&known, &asked)
@@ -1169,21 +1186,47 @@ impl<'a> Mapper<'a> {
     /// Takes out images that do not see what their neighbours in the model see.
     ///
     /// An image that came in through a repeated façade (the initial pair too) is found out once the true surroundings
-    /// of the place have been mapped. It is offered again when more of the model can be matched to it.
+    /// of the place have been mapped, or by pairs that speak against it. It is offered again when more of the model can be matched to it.
     fn expel_misplaced(&mut self) -> usize {
         let mut expelled = 0;
         let mut waiting: Vec<ImageId> = self.model.registered().collect();
+        while let Some((image, seen)) = self.most_contradicted() {
+            self.expel(image, &seen);
+            expelled += 1;
+            waiting.retain(|other| *other != image);
+        }
         // Who is taken out changes what those after it ought to see.
         while let Some((at, seen)) = self.first_misplaced(&waiting) {
-            let image = waiting[at];
-            let points = self.model.observed_points(image);
-            self.records.push(RegistrationRecord::new(image, false, [points, points], &seen));
-            self.model.unregister(image);
-            self.refused_at[image.index()] = count_scene_matches(&self.model, &self.graph, image);
+            self.expel(waiting[at], &seen);
             expelled += 1;
             waiting.drain(..=at);
         }
         expelled
+    }
+
+    fn expel(&mut self, image: ImageId, seen: &Visibility) {
+        let points = self.model.observed_points(image);
+        self.records.push(RegistrationRecord::new(image, false, [points, points], seen));
+        self.model.unregister(image);
+        self.refused_at[image.index()] = count_scene_matches(&self.model, &self.graph, image);
+    }
+
+    /// The panorama whose pairs speak most against its place, where that is untenable.
+    fn most_contradicted(&self) -> Option<(ImageId, Visibility)> {
+        if self.model.registered_count() <= 3 {
+            return None;
+        }
+        let mut most: Option<(f64, ImageId, Rigid)> = None;
+        for image in self.model.registered().filter(|&image| self.model.input.is_panoramic(image)) {
+            let Some(pose) = &self.model.poses[image.index()] else { continue };
+            let support = self.support(image, &pose.world_from_camera);
+            let contradiction = support.contradiction();
+            if support.is_untenable() && most.is_none_or(|(most, ..)| contradiction > most) {
+                most = Some((contradiction, image, pose.world_from_camera));
+            }
+        }
+        let (_, image, pose) = most?;
+        Some((image, visibility(&self.model, image, &pose, &self.model.observations_of(image))))
     }
 
     /// The place of the first of these images that does not see what it ought to.

@@ -62,6 +62,7 @@ const RANGES: &[(&str, Range)] = &[
     ("features.even_share", Range::Share),
     ("features.nadir_cone_deg", Range::Within(0.0, 90.0)),
     ("simulated_tilt", Range::Within(1.0, 8.0)),
+    ("features.faint_tilt", Range::Within(1.0, 8.0)),
     ("pairs.exhaustive_up_to", Range::NotNegative),
     ("pairs.window", Range::NotNegative),
     ("pairs.nearest", Range::NotNegative),

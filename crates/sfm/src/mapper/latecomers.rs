@@ -6,7 +6,7 @@
 //! are mapped, and two things tell right from wrong: the verified pairs agree on one pose, and the image shares with
 //! those next to it what neighbours do ([`super::neighbours`]).
 
-use std::{cmp::Reverse, collections::BTreeMap, f64::consts::PI};
+use std::{cmp::Reverse, f64::consts::PI};
 
 use nalgebra::Vector3;
 
@@ -14,7 +14,7 @@ use super::{
     correspondence::CorrespondenceGraph,
     model::Model,
     register::{PoseHypothesis, scene_matches, visibility},
-    witnesses::count_agreeing,
+    support::Support,
 };
 use crate::{ImageId, PairGeometry, PointId, Rigid, TwoViewKind, solvers::triangulation::length_along};
 
@@ -26,71 +26,6 @@ const CROSSED_PAIRS: usize = 12;
 const SAME_DIRECTION_RAD: f64 = 0.03;
 /// Smallest angle between two directions that a place is told by.
 const MIN_CROSSING_RAD: f64 = 0.1;
-/// Share of a pair's verified matches on the epipolar circles of a pose from which the pair is for that pose.
-const MIN_FOR: f64 = 0.8;
-/// Pairs that have to be for a pose.
-const MIN_PAIRS_FOR: usize = 2;
-/// How many times more matches the pairs for a pose must have than the strongest pair against it, and how many times fewer they
-/// may have than the strongest pair with an image that waits: that of a room with another panorama of the room.
-const LEAD: usize = 2;
-
-/// What the verified pairs of an image say of a pose.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Support {
-    /// Pairs for it.
-    pub pairs: usize,
-    /// Matches of these.
-    pub matches: usize,
-    /// Matches of the strongest pair that is not for it, of those with images of the model and of other large parts.
-    pub against: usize,
-    /// Matches of the strongest pair with an image that waits, too, and says nothing yet.
-    pub waiting: usize,
-}
-
-impl Support {
-    /// Whether that is enough to take it.
-    pub fn is_enough(&self, min_matches: usize) -> bool {
-        let asked = (LEAD * self.against).max(self.waiting / LEAD);
-        self.pairs >= MIN_PAIRS_FOR && self.matches >= min_matches.max(asked)
-    }
-
-    /// Asks all pairs of an image; `taken` are the images of other large parts. Of the geometries of one pair, that which
-    /// agrees best speaks for it.
-    pub fn of(
-        model: &Model<'_>,
-        taken: &[bool],
-        image: ImageId,
-        world_from_camera: &Rigid,
-        max_error_sigma: f64,
-    ) -> Self {
-        let mut by_partner = BTreeMap::new();
-        for pair in model.input.pairs {
-            let Some((other, _)) = pair.seen_from(image) else { continue };
-            let matches = pair.two_view.inliers.len();
-            let agrees = model.poses[other.index()].as_ref().is_some_and(|pose| {
-                let image_from_other = world_from_camera.inverse() * pose.world_from_camera;
-                let agreeing = count_agreeing(model, pair, image, &image_from_other, max_error_sigma);
-                agreeing as f64 >= MIN_FOR * matches as f64
-            });
-            let (speaks_for, speaks_against) = by_partner.entry(other).or_insert((0, 0));
-            let most: &mut usize = if agrees { speaks_for } else { speaks_against };
-            *most = matches.max(*most);
-        }
-        let mut support = Self { pairs: 0, matches: 0, against: 0, waiting: 0 };
-        for (partner, (speaks_for, speaks_against)) in by_partner {
-            if speaks_for > 0 {
-                support.pairs += 1;
-                support.matches += speaks_for;
-            } else if model.is_registered(partner) || taken[partner.index()] {
-                support.against = support.against.max(speaks_against);
-            } else {
-                support.waiting = support.waiting.max(speaks_against);
-            }
-        }
-        support
-    }
-}
-
 /// A verified pair of the image that is sought and a registered one.
 struct Edge {
     matches: usize,
@@ -203,14 +138,5 @@ mod tests {
         let mut behind = edge(1, [1.0, 0.0, 8.0], &truth, 0.0);
         behind.world_from_image.translation = 2.0 * behind.from - behind.world_from_image.translation;
         assert!(crossing(&first, &behind).is_none());
-    }
-
-    #[test]
-    fn one_pair_or_a_strong_contradiction_is_not_enough() {
-        let enough =
-            |pairs, matches, against, waiting| Support { pairs, matches, against, waiting }.is_enough(50);
-        assert!(enough(2, 300, 150, 0) && enough(2, 300, 0, 600));
-        assert!(!enough(1, 300, 0, 0) && !enough(2, 49, 0, 0));
-        assert!(!enough(2, 300, 160, 0) && !enough(2, 300, 0, 700));
     }
 }

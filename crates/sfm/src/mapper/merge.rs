@@ -33,6 +33,7 @@ use super::{
     register::{Visibility, visibility, visibility_beside},
     rework,
     structure::{complete_and_merge, connect},
+    support::Support,
 };
 use crate::{ImageId, PointId, Rigid, Similarity, robust::RansacParams};
 
@@ -652,8 +653,16 @@ impl<'a> Attempt<'_, '_, 'a> {
             || recognizes(self.sides.moved, self.sides.kept) && recognizes(self.sides.kept, self.sides.moved);
         sides.into_iter().all(keeps)
             && ties >= self.params.min_registration_inliers
+            && !self.is_contradicted(model)
             && mapper.first_misplaced(&all).is_none()
             && (recognized() || self.share_as_neighbours(pose))
+    }
+
+    /// Whether a verified pair of panoramas across speaks against the adjusted whole by far more than speaks for it.
+    fn is_contradicted(&self, model: &Model<'_>) -> bool {
+        let is_moved = |image: ImageId| self.sides.moved.is_registered(image);
+        model.registered().all(|image| model.input.is_panoramic(image))
+            && Support::across(model, is_moved, self.params.max_error_sigma).is_untenable()
     }
 }
 
