@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 
-use super::{model::Model, witnesses::count_on_circles};
+use super::{model::Model, witnesses::count_agreeing};
 use crate::{ImageId, PairGeometry, Rigid};
 
 /// Share of a pair's verified matches on the epipolar circles of a pose from which the pair is for that pose.
@@ -130,15 +130,15 @@ fn ask(
 ) -> BTreeMap<[ImageId; 2], PairSays> {
     let mut said: BTreeMap<[ImageId; 2], PairSays> = BTreeMap::new();
     for pair in model.input.pairs.iter().filter(|pair| counts(pair)) {
-        let matches = &pair.two_view.inliers;
+        let matches = pair.two_view.inliers.len();
         let agrees = pose(pair.first).zip(pose(pair.second)).is_some_and(|(first, second)| {
-            let rays = [pair.first, pair.second].map(|image| &model.rays[image.index()]);
-            let agreeing = count_on_circles(rays, &(second.inverse() * first), matches, max_error_sigma);
-            agreeing as f64 >= MIN_FOR * matches.len() as f64
+            let second_from_first = second.inverse() * first;
+            let agreeing = count_agreeing(model, pair, pair.second, &second_from_first, max_error_sigma);
+            agreeing as f64 >= MIN_FOR * matches as f64
         });
         let said = said.entry([pair.first, pair.second]).or_default();
         let most = if agrees { &mut said.agreeing } else { &mut said.refused };
-        *most = matches.len().max(*most);
+        *most = matches.max(*most);
     }
     said
 }
