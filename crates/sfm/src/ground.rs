@@ -29,7 +29,7 @@ pub(crate) const PATCH: PatchParams =
 const MIN_FIRST: f64 = 0.35;
 
 /// Sharpens the poses of pairs whose length no common points tell ([`Reconstruction::lengths`]), where both photos show
-/// the ground that other photos of the component show too. Returns how many it sharpened.
+/// the ground that other photos of the component show too; those of panoramas stay as they are. Returns how many it sharpened.
 ///
 /// `load` gives the pixels of an image and is called at most once for each image and length. Equal inputs give
 /// equal results on any number of threads.
@@ -66,6 +66,9 @@ impl<'a> Corner<'a> {
         length: &'a BaselineLength,
         load: &impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E>,
     ) -> Result<Option<Self>, E> {
+        if component.camera_of(length.to).is_panoramic() {
+            return Ok(None);
+        }
         let pose = |image: ImageId| component.images[image.index()].world_from_camera;
         let Some([from, reference]) = pose(length.from).zip(pose(length.reference)).map(<[Rigid; 2]>::from)
         else {

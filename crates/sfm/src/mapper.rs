@@ -6,6 +6,7 @@ mod calibration;
 pub(crate) mod continuation;
 mod corner;
 mod correspondence;
+mod depths;
 mod direction;
 mod divide;
 mod initial;
@@ -28,6 +29,7 @@ mod support;
 mod test_street;
 mod told;
 mod triplets;
+mod votes;
 pub(crate) mod wall;
 mod witnesses;
 
@@ -51,8 +53,12 @@ use self::{
     calibration::calibrate,
     continuation::{Continued, continue_planes},
     correspondence::CorrespondenceGraph,
+    depths::{is_indoors, stands_on_floor},
     divide::divide,
-    latecomers::{FEW_IMAGES, hypothesize_from_crossings},
+    latecomers::{
+        FEW_IMAGES, best_crossing, count_held_by_pairs, hypothesize_from_crossings, hypothesize_from_depths,
+        may_be_left,
+    },
     lens::choose_lenses,
     model::Model,
     neighbours::{Neighbours, neighbours, share_as_neighbours, share_with_one},
@@ -65,7 +71,7 @@ use self::{
     standpoint::Standpoints,
     stitching::measure_stitching,
     structure::{PointLimits, complete_and_merge, filter, triangulate_image, triangulate_match},
-    support::Support,
+    support::{Support, Worth},
     told::correct_told,
     witnesses::{Testimony, Witnesses, count_agreeing},
 };
@@ -77,11 +83,12 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 43;
+pub const MAPPER_VERSION: u32 = 44;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
+#[expect(clippy::struct_excessive_bools, reason = "each stands for one thing that may be left out")]
 pub struct MapperParams {
     /// Largest angular error of an observation, in standard deviations of its ray.
     pub max_error_sigma: f64,
@@ -127,6 +134,9 @@ pub struct MapperParams {
     /// Whether an image that shares nothing with more than one other gets the length of its baseline from planes of the
     /// model that go on. It applies to local models of photo sets only.
     pub continue_planes: bool,
+    /// Whether panoramas, and parts of a place, that one pair joins get the length of that step from what lies beside what the pair
+    /// shares and from the floor, where such pairs can be believed. Otherwise they stay apart.
+    pub join_by_depths: bool,
     /// Whether photos are asked for the focal lengths that they are told, and have others, a percent off, where these explain
     /// the model clearly better. It applies to local models of photo sets only.
     pub correct_told: bool,
@@ -160,6 +170,7 @@ impl Default for MapperParams {
             global_bundle_growth: 1.4,
             loss_sigma: 1.0,
             continue_planes: true,
+            join_by_depths: true,
             correct_told: true,
             calibrate_panoramas: true,
         }
@@ -444,13 +455,17 @@ fn map_parts(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> (Vec<
         parts.push(mapper.into_part());
     }
     let parts = merge::join_supported(params, input, parts, &mut report, seed);
-    (admit_latecomers(params, input, parts, &mut report, seed), report)
+    let mut parts = admit_latecomers(params, input, parts, &mut report, seed);
+    while params.join_by_depths && merge::join_hung(params, input, &mut parts, &mut report, seed) {
+        parts = admit_latecomers(params, input, parts, &mut report, seed);
+    }
+    (parts, report)
 }
 
 /// The parts with the images that only their pairs and what they share with neighbours speak for, largest first.
 ///
-/// Images of parts of hardly any images may leave them for a larger one. Only of panoramas is it known what neighbours
-/// share, so nothing changes without any.
+/// Images may leave parts of hardly any images, or that their pairs speak against, for a larger one. Only of panoramas is it
+/// known what neighbours share, so nothing changes without any.
 fn admit_latecomers(
     params: &MapperParams,
     input: &MapperInput<'_>,
@@ -462,20 +477,20 @@ fn admit_latecomers(
         return parts;
     }
     let mut at = 0;
-    while at < parts.len() && parts[at].size() > FEW_IMAGES {
-        let is_open = |&other: &usize| other == at || parts[other].size() <= FEW_IMAGES;
+    while at < parts.len() {
+        let is_open = |other: &usize| *other == at || may_be_left(input, &parts[*other]);
         let open: Vec<usize> = (0..parts.len()).filter(is_open).collect();
         let taken = merge::taken_by_others(input, &parts, &open);
         let part = &parts[at];
         let waits =
             |(image, taken): (&ReconstructionImage, &bool)| image.world_from_camera.is_none() && !taken;
-        if !part.component.images.iter().zip(&taken).any(waits) {
+        if may_be_left(input, part) || !part.component.images.iter().zip(&taken).any(waits) {
             at += 1;
             continue;
         }
         let mut mapper = Mapper::over(params, Model::open(input, &part.component, &taken), taken, seed);
         mapper.anchors.clone_from(&part.anchors);
-        mapper.admits_latecomers = true;
+        mapper.admit_latecomers();
         mapper.grow();
         let has_grown = mapper.model.registered_count() > part.size();
         if has_grown {
@@ -578,6 +593,7 @@ fn seen_again(params: &MapperParams, input: &MapperInput<'_>, part: Part, seed: 
 type Anchors = Vec<Option<(ImageId, UnitQuaternion<f64>)>>;
 
 /// A finished component with what its images are held by.
+#[derive(Clone)]
 struct Part {
     component: Reconstruction,
     anchors: Anchors,
@@ -670,6 +686,8 @@ struct Mapper<'a> {
     witnesses: Option<&'a Witnesses>,
     /// Whether images come in that only their pairs and what they share with neighbours speak for.
     admits_latecomers: bool,
+    /// Whether such images may come in by one pair whose length depths tell.
+    admits_by_depths: bool,
     seed: u64,
 }
 
@@ -705,8 +723,15 @@ impl<'a> Mapper<'a> {
             records: Vec::new(),
             witnesses: None,
             admits_latecomers: false,
+            admits_by_depths: false,
             seed,
         }
+    }
+
+    /// Lets images come in from now on that only their pairs speak for.
+    fn admit_latecomers(&mut self) {
+        self.admits_latecomers = true;
+        self.admits_by_depths = self.params.join_by_depths && is_indoors(&self.model);
     }
 
     fn into_part(self) -> Part {
@@ -868,9 +893,7 @@ impl<'a> Mapper<'a> {
                 continue;
             }
             let Edge { pair, image, other, image_from_other } = edge;
-            let PairGeometry { first, two_view, .. } = &self.model.input.pairs[pair];
-            let turned = |m: &Match| if *first == other { *m } else { m.swapped() };
-            let verified: Vec<Match> = two_view.inliers.iter().map(turned).collect();
+            let verified = self.model.input.pairs[pair].matches_from(other);
             let seed = self.seed ^ ((pair as u64) << 32);
             let continued = continue_planes(&self.model, image, other, (&image_from_other, &verified), seed);
             found.extend(continued.map(|continued| (pair, continued)));
@@ -879,10 +902,15 @@ impl<'a> Mapper<'a> {
         let mut found = found.into_iter();
         let mut records = Vec::new();
         let accepted = found.by_ref().find_map(|(_, continued)| {
-            let Continued { world_from_camera, length: BaselineLength { to, votes, .. }, .. } = continued;
-            let visibility = visibility(&self.model, to, &world_from_camera, &[]);
-            let hypothesis =
-                PoseHypothesis { world_from_camera, inliers: Vec::new(), candidates: votes, visibility };
+            let Continued { world_from_camera, length, .. } = continued;
+            let BaselineLength { to, votes, .. } = length;
+            let hypothesis = PoseHypothesis {
+                world_from_camera,
+                inliers: Vec::new(),
+                candidates: votes,
+                visibility: visibility(&self.model, to, &world_from_camera, &[]),
+                length: Some(length),
+            };
             Some((self.first_accepted(to, vec![hypothesis], &mut false, &mut records)?, continued))
         });
         self.records.append(&mut records);
@@ -892,7 +920,6 @@ impl<'a> Mapper<'a> {
         let (pose, Continued { length, matches, .. }) = accepted?;
         let BaselineLength { from, to: image, .. } = length;
         register(&mut self.model, image, &pose);
-        self.model.lengths.push(length);
         for m in matches {
             let [a, b] =
                 [(from, m.first), (image, m.second)].map(|(image, feature)| Observation { image, feature });
@@ -999,7 +1026,12 @@ impl<'a> Mapper<'a> {
         let mut waiting: Vec<(usize, ImageId)> = open
             .into_par_iter()
             .with_max_len(1)
-            .map(|image| (count_scene_matches(&self.model, &self.graph, image), image))
+            .map(|image| {
+                let count = count_scene_matches(&self.model, &self.graph, image);
+                let of_pairs =
+                    if self.admits_latecomers { count_held_by_pairs(&self.model, image) } else { 0 };
+                (count.max(of_pairs), image)
+            })
             .filter(|&(count, image)| {
                 count >= self.params.min_confirmed_inliers.min(self.params.min_registration_inliers)
                     && count > self.refused_at[image.index()] * 11 / 10
@@ -1057,6 +1089,14 @@ impl<'a> Mapper<'a> {
             let pose = crossed.filter(|pose| self.is_latecomer(image, &pose.world_from_camera))?;
             self.first_accepted(image, vec![pose], &mut has_rival, &mut records)
         });
+        let pose = pose.or_else(|| {
+            let hung = self.admits_by_depths.then(|| {
+                let sigmas = self.params.max_error_sigma;
+                hypothesize_from_depths(&self.model, &self.graph, &self.taken, image, sigmas)
+            })?;
+            let pose = hung.filter(|pose| self.may_hang(image, &pose.world_from_camera))?;
+            self.first_accepted(image, vec![pose], &mut has_rival, &mut records)
+        });
         (pose, records)
     }
 
@@ -1079,7 +1119,9 @@ impl<'a> Mapper<'a> {
                 None if judged => self.params.is_recognized(&seen),
                 None => !refused_before,
             };
-            let plausible = plausible || self.is_latecomer(image, &hypothesis.world_from_camera);
+            let plausible = plausible
+                || hypothesis.length.is_some() && self.may_hang(image, &hypothesis.world_from_camera)
+                || self.is_latecomer(image, &hypothesis.world_from_camera);
             refused_before |= !plausible;
             let is_contradicted = self.model.input.is_panoramic(image) && {
                 let support = self.support(image, &hypothesis.world_from_camera);
@@ -1121,10 +1163,32 @@ impl<'a> Mapper<'a> {
     fn is_latecomer(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
         self.admits_latecomers
             && self.support(image, world_from_camera).is_enough(self.params.min_initial_points)
-            && {
-                let (known, asked) = self.neighbours_of(image, world_from_camera);
-                share_with_one(&known, &asked)
-            }
+            && self.shares_with_one(image, world_from_camera)
+    }
+
+    /// Whether an image may hang at a pose by one pair whose length depths tell.
+    fn may_hang(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        let sigmas = self.params.max_error_sigma;
+        let support = self.support(image, world_from_camera);
+        let is_at_home = || {
+            support.is_strong()
+                || self.shares_with_one(image, world_from_camera)
+                || stands_on_floor(&self.model, image, world_from_camera, sigmas)
+        };
+        self.admits_by_depths
+            && support.is_enough_if_right()
+            && Worth::of(&[&self.model], sigmas).believes(support.widest)
+            && is_at_home()
+    }
+
+    /// Whether a registered image hangs so.
+    fn hangs(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        self.model.lengths.iter().any(|length| length.to == image) && self.may_hang(image, world_from_camera)
+    }
+
+    fn shares_with_one(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        let (known, asked) = self.neighbours_of(image, world_from_camera);
+        share_with_one(&known, &asked)
     }
 
     /// Whether an image shares with those next to a pose what neighbours do, by what these share with theirs.
@@ -1190,10 +1254,14 @@ impl<'a> Mapper<'a> {
     fn expel_misplaced(&mut self) -> usize {
         let mut expelled = 0;
         let mut waiting: Vec<ImageId> = self.model.registered().collect();
-        while let Some((image, seen)) = self.most_contradicted() {
-            self.expel(image, &seen);
-            expelled += 1;
-            waiting.retain(|other| *other != image);
+        while let Some(group) = self.most_contradicted() {
+            for image in group {
+                if let Some(seen) = self.seen_by(image) {
+                    self.expel(image, &seen);
+                    expelled += 1;
+                }
+                waiting.retain(|other| *other != image);
+            }
         }
         // Who is taken out changes what those after it ought to see.
         while let Some((at, seen)) = self.first_misplaced(&waiting) {
@@ -1211,22 +1279,22 @@ impl<'a> Mapper<'a> {
         self.refused_at[image.index()] = count_scene_matches(&self.model, &self.graph, image);
     }
 
-    /// The panorama whose pairs speak most against its place, where that is untenable.
-    fn most_contradicted(&self) -> Option<(ImageId, Visibility)> {
+    /// The panoramas whose pairs speak most against their place, where that is untenable: one or a few that belong together.
+    fn most_contradicted(&self) -> Option<Vec<ImageId>> {
         if self.model.registered_count() <= 3 {
             return None;
         }
-        let mut most: Option<(f64, ImageId, Rigid)> = None;
-        for image in self.model.registered().filter(|&image| self.model.input.is_panoramic(image)) {
-            let Some(pose) = &self.model.poses[image.index()] else { continue };
-            let support = self.support(image, &pose.world_from_camera);
-            let contradiction = support.contradiction();
-            if support.is_untenable() && most.is_none_or(|(most, ..)| contradiction > most) {
-                most = Some((contradiction, image, pose.world_from_camera));
-            }
-        }
-        let (_, image, pose) = most?;
-        Some((image, visibility(&self.model, image, &pose, &self.model.observations_of(image))))
+        let at_most = FEW_IMAGES.min(self.model.registered_count() / 3);
+        let may_leave = |image: ImageId| self.model.input.is_panoramic(image);
+        let sigmas = self.params.max_error_sigma;
+        let elsewhere = |image: ImageId| best_crossing(&self.model, &self.taken, image, sigmas);
+        support::most_contradicted(&self.model, may_leave, elsewhere, at_most, sigmas)
+    }
+
+    /// What a registered image sees of what it ought to.
+    fn seen_by(&self, image: ImageId) -> Option<Visibility> {
+        let pose = self.model.poses[image.index()]?.world_from_camera;
+        Some(visibility(&self.model, image, &pose, &self.model.observations_of(image)))
     }
 
     /// The place of the first of these images that does not see what it ought to.
@@ -1246,6 +1314,7 @@ impl<'a> Mapper<'a> {
                         && !self.params.is_recognized(&seen)
                         && !self.shares_as_neighbour(image, &pose)
                         && !self.is_latecomer(image, &pose)
+                        && !self.hangs(image, &pose)
                 }
             };
             is_misplaced.then_some((at, seen))

@@ -94,6 +94,12 @@ pub struct PairGeometry {
 }
 
 impl PairGeometry {
+    /// The verified matches with the keypoints of this image, one of the two, first.
+    pub(crate) fn matches_from(&self, image: ImageId) -> Vec<Match> {
+        let turned = |m: &Match| if self.first == image { *m } else { m.swapped() };
+        self.two_view.inliers.iter().map(turned).collect()
+    }
+
     /// The other image and `image_from_other`, its translation of unit length; `None` for an image not of the pair.
     pub fn seen_from(&self, image: ImageId) -> Option<(ImageId, Rigid)> {
         let second_from_first = self.two_view.second_from_first;

@@ -1,5 +1,7 @@
 //! The mapper on synthetic streets with exact truth.
 
+use std::collections::HashMap;
+
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -110,11 +112,13 @@ impl Street {
 
     fn matches(&self, a: usize, b: usize, rng: &mut ChaCha8Rng) -> Vec<Match> {
         let mut found = Vec::new();
-        for (first, &p) in self.point_of[a].iter().enumerate() {
+        // The first of each stays.
+        let seen = || self.point_of[b].iter().enumerate().rev();
+        let places: HashMap<usize, usize> = seen().map(|(at, &q)| (q, at)).collect();
+        let looks: HashMap<usize, usize> = seen().map(|(at, &q)| (self.look[q], at)).collect();
+        for (first, p) in self.point_of[a].iter().enumerate() {
             // A look-alike is taken for the point only where the point itself is not in sight.
-            let exact = self.point_of[b].iter().position(|&q| q == p);
-            let twin = || self.point_of[b].iter().position(|&q| self.look[q] == self.look[p]);
-            if let Some(second) = exact.or_else(twin)
+            if let Some(&second) = places.get(p).or_else(|| looks.get(&self.look[*p]))
                 && rng.random_bool(0.7)
             {
                 found.push(Match { first: first as u32, second: second as u32 });
@@ -619,10 +623,10 @@ fn two_halves_that_only_few_matches_tie_become_one() {
     assert_eq!(output, on(1));
 }
 
-/// Panoramas along a corridor (x across, y down, z along), one in a door of it, and one in the room behind, which sees next
-/// to nothing that two others see as it does; all far down the corridor would be in its plain view but for the wall.
-#[test]
-fn a_room_behind_a_door_belongs_to_its_corridor() {
+/// Panoramas along a corridor (x across, y down, z along), one in a door of it, and some in the room behind; walls and the floor
+/// have points. Where one pair alone joins them, it is that of the door and the first in the room, and its matches are of what no
+/// panorama of the corridor sees.
+fn map_house(in_room: &[[f64; 3]], by_one_pair: bool) -> (Street, MapperOutput) {
     let mut rng = ChaCha8Rng::seed_from_u64(11);
     let mut points: Vec<Vector3<f64>> = (0..1600)
         .map(|_| {
@@ -635,6 +639,11 @@ fn a_room_behind_a_door_belongs_to_its_corridor() {
         let [x, z] = [[across, 16.0], [across, 20.0], [6.0, along]][rng.random_range(0..3)];
         Vector3::new(x, rng.random_range(-1.3..1.2), z)
     }));
+    let floor = |rng: &mut ChaCha8Rng, across: [f64; 2], along: [f64; 2]| {
+        Vector3::new(rng.random_range(across[0]..across[1]), 1.4, rng.random_range(along[0]..along[1]))
+    };
+    points.extend((0..300).map(|_| floor(&mut rng, [-1.2, 1.2], [-3.0, 40.0])));
+    points.extend((0..150).map(|_| floor(&mut rng, [1.6, 6.0], [16.0, 20.0])));
     // Nothing is seen through the wall but through the door.
     let wall = 1.4;
     let sees = |from: &Vector3<f64>, point: &Vector3<f64>| {
@@ -644,7 +653,8 @@ fn a_room_behind_a_door_belongs_to_its_corridor() {
     };
     let mut centers: Vec<Vector3<f64>> =
         (0..10).map(|k| Vector3::new(rng.random_range(-0.3..0.3), 0.0, 4.0 * f64::from(k))).collect();
-    centers.extend([Vector3::new(wall + 0.1, 0.05, 18.0), Vector3::new(3.3, 0.0, 18.3)]);
+    centers.push(Vector3::new(wall + 0.1, 0.05, 18.0));
+    centers.extend(in_room.iter().map(|at| Vector3::from(*at)));
     let camera = Camera::equirectangular(3072, 1536);
     let mut house = Street {
         truth: vec![],
@@ -671,7 +681,17 @@ fn a_room_behind_a_door_belongs_to_its_corridor() {
         house.features.push(features);
         house.point_of.push(seen);
     }
-    let pairs = house.verified_pairs(&house.cameras);
+    let mut pairs = house.verified_pairs(&house.cameras);
+    if by_one_pair {
+        let [door, first_in_room] = [ImageId(10), ImageId(11)];
+        let crosses = |pair: &PairGeometry| pair.first < first_in_room && pair.second >= first_in_room;
+        pairs.retain(|pair| !crosses(pair) || [pair.first, pair.second] == [door, first_in_room]);
+        let is_seen_beyond = |point: &usize| house.point_of[..10].iter().any(|seen| seen.contains(point));
+        for pair in pairs.iter_mut().filter(|pair| crosses(pair)) {
+            let point = |m: &Match| house.point_of[door.index()][m.first as usize];
+            pair.two_view.inliers.retain(|m| !is_seen_beyond(&point(m)));
+        }
+    }
     let putative: Vec<PutativePair> = pairs
         .iter()
         .map(|pair| PutativePair {
@@ -691,9 +711,41 @@ fn a_room_behind_a_door_belongs_to_its_corridor() {
         two_view: TwoViewParams::default(),
     };
     let output = reconstruct(&MapperParams::default(), &input, 5);
+    (house, output)
+}
+
+/// The room sees next to nothing that two others see as it does; all far down the corridor would be in its plain view but for the
+/// wall.
+#[test]
+fn a_room_behind_a_door_belongs_to_its_corridor() {
+    let (house, output) = map_house(&[[3.3, 0.0, 18.3]], false);
     let (registered, worst_m, worst_deg) = house.errors(&output);
     assert_eq!(registered, 12, "{:?}", output.report.registrations);
     assert!(worst_m < 0.02 && worst_deg < 0.1, "{worst_m} m, {worst_deg}°");
+    assert!(output.components[0].lengths.is_empty());
+}
+
+/// Nothing that the room shows is seen by any but the panorama in the door, so that only what lies beside tells how far it is.
+#[test]
+fn a_room_that_one_pair_joins_has_the_distance_that_what_lies_beside_tells() {
+    let (house, output) = map_house(&[[3.3, 0.0, 18.3]], true);
+    let (registered, worst_m, worst_deg) = house.errors(&output);
+    assert_eq!(registered, 12, "{:?}", output.report.registrations);
+    assert!(worst_m < 0.1 && worst_deg < 0.1, "{worst_m} m, {worst_deg}°");
+    let [length] = output.components[0].lengths[..] else { panic!("{:?}", output.components[0].lengths) };
+    assert_eq!([length.from, length.to], [ImageId(10), ImageId(11)]);
+    assert!((0.005..0.1).contains(&length.deviation), "{}", length.deviation);
+}
+
+/// The same of a room of four panoramas, which are a part of their own.
+#[test]
+fn rooms_that_one_pair_joins_become_one_part() {
+    let in_room = [[2.6, 0.0, 17.0], [3.3, 0.02, 18.3], [4.6, -0.02, 17.4], [4.1, 0.0, 19.2]];
+    let (house, output) = map_house(&in_room, true);
+    assert_eq!(verdicts(&output).last(), Some(&MergeVerdict::Hung), "{:?}", output.report.merges);
+    let (registered, worst_m, worst_deg) = house.errors(&output);
+    assert_eq!(registered, 15, "{:?}", output.report.registrations);
+    assert!(worst_m < 0.1 && worst_deg < 0.1, "{worst_m} m, {worst_deg}°");
 }
 
 #[test]

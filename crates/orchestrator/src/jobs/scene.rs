@@ -189,6 +189,9 @@ pub fn add_scene(
         let notes_of_errors: Vec<String> =
             shared_errors.iter().enumerate().filter_map(shared_errors_note).collect();
         let stretches: Vec<String> = output.components.iter().enumerate().filter_map(stretch_note).collect();
+        let lengths: Vec<String> = (output.components.iter().enumerate())
+            .filter_map(|numbered| lengths_note(numbered, &names))
+            .collect();
         Product::new(SceneFile {
             components,
             indices: copy,
@@ -206,6 +209,7 @@ pub fn add_scene(
                 .chain(recall.as_ref().map(Recall::note))
                 .chain(fixes.as_deref().map(|fixes| positions::note(fixes, listed)))
                 .chain(relative)
+                .chain(lengths)
                 .chain(stretches)
                 .chain(notes_of_errors)
                 .collect(),
@@ -253,6 +257,29 @@ fn stretch_note((component, model): (usize, &Reconstruction)) -> Option<String> 
         )
     })
 }
+
+/// Says which distances between images of a component no point tells, where there are any.
+fn lengths_note((component, model): (usize, &Reconstruction), names: &[String]) -> Option<String> {
+    let percents = || model.lengths.iter().map(|length| 100.0 * length.deviation);
+    let (least, most) = (percents().reduce(f64::min)?, percents().reduce(f64::max)?);
+    let mut steps: Vec<String> = (model.lengths.iter())
+        .map(|length| format!("{} from {}", names[length.to.index()], names[length.from.index()]))
+        .collect();
+    let more = steps.len().saturating_sub(MAX_STEPS_NAMED);
+    steps.truncate(MAX_STEPS_NAMED);
+    if more > 0 {
+        steps.push(format!("and {more} more"));
+    }
+    Some(format!(
+        "distances{} rest on what lies beside the points of one pair and on the floor, not on points that a third \
+         panorama sees (± {least:.0} to {most:.0} %): {}",
+        of_component(component),
+        steps.join(", ")
+    ))
+}
+
+/// Steps that are named where a note is of many.
+const MAX_STEPS_NAMED: usize = 5;
 
 /// Says what errors the images of a component share, where any are told.
 fn shared_errors_note((component, errors): (usize, &Option<SharedErrors>)) -> Option<String> {

@@ -102,7 +102,7 @@ fn moved_to<'a>(
     register(
         &mut trial,
         image,
-        &PoseHypothesis { world_from_camera: *pose, inliers, candidates, visibility },
+        &PoseHypothesis { world_from_camera: *pose, inliers, candidates, visibility, length: None },
     );
     for _ in 0..2 {
         // The other images hold still: a wrong pose would drag them along.

@@ -25,6 +25,7 @@ use super::{
     corner::PairByWall,
     model::Model,
     plane::{Plane, SeenPoint, find_planes},
+    votes::{LEAD, Opinion, peaks},
     witnesses::count_on_circles,
 };
 use crate::{
@@ -52,25 +53,17 @@ const MAX_NORMAL_RAD: f64 = 0.17;
 const MAX_GAP: f64 = 2.0;
 /// Which of the nearest points of a plane tells how far it is to go on: one may be astray.
 const GAP_POINT: usize = 3;
-/// Range of the logarithm of lengths among which votes for nothing scatter.
-const RANGE: f64 = 6.0;
 /// Fewest votes that must agree.
 const MIN_VOTES: f64 = 9.0;
 /// Least logarithm of the likelihood of a length, relative to none.
 const MIN_LOG_LIKELIHOOD: f64 = 20.0;
-/// How many times more that must be than for any other length.
-pub(super) const LEAD: f64 = 3.0;
 /// How many times more it must be than for depths dealt out anew.
 const CHANCE_LEAD: f64 = 2.0;
 /// Largest factor between the length and that of the reference baseline. Who takes photos on the way somewhere takes
 /// steps of one kind; what gives another length is a wall that is parallel to a nearer one.
 pub(super) const MAX_STEP_RATIO: f64 = 4.0;
-/// Lengths whose logarithms differ by less are one.
-const SAME_LENGTH: f64 = 0.15;
 /// How often depths are dealt out anew to see what chance gives.
 const SHUFFLES: usize = 8;
-/// Most lengths that are compared.
-const MAX_CANDIDATES: usize = 160;
 /// Beyond its points by this share of its distance, a wall may have a step.
 const STEP_GAP: f64 = 0.1;
 /// Standard deviation of a wall's distance within its points and beyond, as a share of it.
@@ -96,14 +89,10 @@ pub(super) struct Vote {
     plane_sigma: f64,
 }
 
-/// A length that votes agree on.
-#[derive(Debug, Clone, Copy)]
-struct Peak {
-    /// Logarithm of the length.
-    length: f64,
-    log_likelihood: f64,
-    /// Votes that agree, each by its probability.
-    votes: f64,
+impl Vote {
+    fn opinion(&self) -> Opinion {
+        Opinion { length: self.plane_depth - self.depth, sigma: self.sigma }
+    }
 }
 
 /// A length and the votes that agree on it.
@@ -194,7 +183,7 @@ const PAIR_DIRECTION_RAD: f64 = 0.045;
 const PAIR_ROTATION_RAD: f64 = 0.009;
 
 /// Covariance of rotation and centre after a step whose length has this relative standard deviation.
-fn of_unknown_direction(step: &Vector3<f64>, deviation: f64) -> Matrix6<f64> {
+pub(super) fn of_unknown_direction(step: &Vector3<f64>, deviation: f64) -> Matrix6<f64> {
     let along = step * step.transpose() / step.norm_squared();
     let across = Matrix3::identity() - along;
     let mut covariance = Matrix6::identity() * PAIR_ROTATION_RAD.powi(2);
@@ -204,7 +193,7 @@ fn of_unknown_direction(step: &Vector3<f64>, deviation: f64) -> Matrix6<f64> {
 }
 
 /// The image that shares most points with this one from another place.
-fn reference_of(model: &Model<'_>, image: ImageId) -> Option<ImageId> {
+pub(super) fn reference_of(model: &Model<'_>, image: ImageId) -> Option<ImageId> {
     let center = model.poses[image.index()].as_ref()?.center();
     let seen = model.observations_of(image);
     let tracks = seen.iter().filter_map(|(_, id)| Some(&model.point(*id)?.track[..]));
@@ -230,7 +219,8 @@ pub(crate) fn reference_among<'t>(
     Some(most)
 }
 
-fn known_points(model: &Model<'_>, image: ImageId, center: &Vector3<f64>) -> Vec<SeenPoint> {
+/// The points that an image sees, from its centre in the axes of the world.
+pub(super) fn known_points(model: &Model<'_>, image: ImageId, center: &Vector3<f64>) -> Vec<SeenPoint> {
     let seen = |(_, id)| {
         let point = model.point(id)?;
         let rays: Vec<WorldRay> = point.track.iter().filter_map(|&seen| model.world_ray(seen)).collect();
@@ -374,7 +364,7 @@ const RANSAC: RansacParams = RansacParams {
 /// Groups of matches of which each is left out once.
 const GROUPS: usize = 8;
 /// Standard deviation of the logarithm of a point's depth.
-fn depth_sigma(point: &SeenPoint) -> f64 {
+pub(super) fn depth_sigma(point: &SeenPoint) -> f64 {
     let direction = point.position.normalize();
     direction.dot(&(point.covariance * direction)).max(0.0).sqrt() / point.position.norm()
 }
@@ -479,76 +469,16 @@ fn gap(known: &[SeenPoint], plane: &Plane, place: &Vector3<f64>) -> Option<f64> 
 
 /// The length that votes agree on; `None` unless one length stands out.
 pub(super) fn length_of(votes: &[Vote], seed: u64) -> Option<Peaked> {
-    let opinions: Vec<(f64, f64)> =
-        votes.iter().map(|vote| (vote.plane_depth - vote.depth, vote.sigma)).collect();
+    let opinions: Vec<Opinion> = votes.iter().map(Vote::opinion).collect();
     let (best, second) = peaks(&opinions)?;
     let chance = by_chance(votes, seed);
     let enough = best.votes >= MIN_VOTES && best.log_likelihood >= MIN_LOG_LIKELIHOOD;
     if !enough || best.log_likelihood < LEAD * second || best.log_likelihood < CHANCE_LEAD * chance {
         return None;
     }
-    let agreeing: Vec<Vote> = votes
-        .iter()
-        .filter(|vote| (vote.plane_depth - vote.depth - best.length).abs() <= 3.0 * vote.sigma)
-        .copied()
-        .collect();
+    let agreeing: Vec<Vote> =
+        votes.iter().filter(|vote| vote.opinion().agrees(best.length)).copied().collect();
     Some(Peaked { length: best.length, log_likelihood: best.log_likelihood, agreeing })
-}
-
-/// The best supported length, and the likelihood of the best that differs from it.
-fn peaks(opinions: &[(f64, f64)]) -> Option<(Peak, f64)> {
-    let mut lengths: Vec<f64> = opinions.iter().map(|(length, _)| *length).collect();
-    lengths.sort_by(f64::total_cmp);
-    let stride = lengths.len().div_ceil(MAX_CANDIDATES).max(1);
-    let candidates: Vec<Peak> =
-        lengths.iter().step_by(stride).map(|&length| support(opinions, length)).collect();
-    let mut best =
-        *candidates.iter().reduce(|a, b| if b.log_likelihood > a.log_likelihood { b } else { a })?;
-    for _ in 0..REFINEMENTS {
-        let refined = support(opinions, mean_near(opinions, best.length)?);
-        if refined.log_likelihood <= best.log_likelihood {
-            break;
-        }
-        best = refined;
-    }
-    let others = candidates.iter().filter(|other| (other.length - best.length).abs() > SAME_LENGTH);
-    Some((best, others.map(|other| other.log_likelihood).fold(0.0, f64::max)))
-}
-
-/// Most steps from the best vote to the mean of those round it.
-const REFINEMENTS: usize = 20;
-/// Steps of expectation maximization for the share of right votes.
-const MIXTURE_STEPS: usize = 12;
-
-/// Logarithm of the likelihood of a length, relative to votes that scatter over the whole range: a mixture of votes
-/// that are right within their noise and of others, in the proportion that suits best.
-fn support(opinions: &[(f64, f64)], length: f64) -> Peak {
-    let densities: Vec<f64> = opinions
-        .iter()
-        .map(|&(opinion, sigma)| {
-            let error = (opinion - length) / sigma;
-            RANGE * (-0.5 * error * error).exp() / (sigma * std::f64::consts::TAU.sqrt())
-        })
-        .collect();
-    let (mut share, mut votes) = (0.5, 0.0);
-    for _ in 0..MIXTURE_STEPS {
-        votes = densities.iter().map(|right| share * right / (share * right + 1.0 - share)).sum();
-        share = (votes / opinions.len() as f64).clamp(1e-3, 1.0 - 1e-3);
-    }
-    let log_likelihood = densities.iter().map(|right| (share * right + 1.0 - share).ln()).sum();
-    Peak { length, log_likelihood, votes }
-}
-
-/// Mean of the votes near a length, weighted by their noise and by how near they are.
-fn mean_near(opinions: &[(f64, f64)], length: f64) -> Option<f64> {
-    let (mut sum, mut weights) = (0.0, 0.0);
-    for &(opinion, sigma) in opinions {
-        let error = (opinion - length) / sigma;
-        let weight = (-0.5 * error * error).exp() / (sigma * sigma);
-        sum += weight * (opinion - length);
-        weights += weight;
-    }
-    (weights > 0.0).then(|| length + sum / weights)
 }
 
 /// The best likelihood of any length when the depths of the pair are dealt out anew among the votes.
@@ -558,11 +488,11 @@ fn by_chance(votes: &[Vote], seed: u64) -> f64 {
     let mut most = 0.0_f64;
     for _ in 0..SHUFFLES {
         dealt.shuffle(&mut rng);
-        let opinions: Vec<(f64, f64)> = votes
-            .iter()
-            .zip(&dealt)
-            .map(|(vote, &other)| (vote.plane_depth - votes[other].depth, vote.sigma.max(votes[other].sigma)))
-            .collect();
+        let opinion = |(vote, &other): (&Vote, &usize)| Opinion {
+            length: vote.plane_depth - votes[other].depth,
+            sigma: vote.sigma.max(votes[other].sigma),
+        };
+        let opinions: Vec<Opinion> = votes.iter().zip(&dealt).map(opinion).collect();
         most = most.max(peaks(&opinions).map_or(0.0, |(best, _)| best.log_likelihood));
     }
     most

@@ -8,9 +8,10 @@ use nalgebra::{Matrix6, Vector3};
 use setloc_features::{DESCRIPTOR_LEN, Match, squared_distance};
 
 use super::{
-    continuation::{BANDS_RAD, LEAD, MAX_STEP_RATIO, Met, Pair, Surroundings, length_of, of_planes, votes},
+    continuation::{BANDS_RAD, MAX_STEP_RATIO, Met, Pair, Surroundings, length_of, of_planes, votes},
     model::Model,
     nearby::Nearby,
+    votes::LEAD,
     wall::{Bearings, Measured, OnPlane, PLANES, WallPair},
 };
 use crate::{ImageId, Rigid, StepPose};

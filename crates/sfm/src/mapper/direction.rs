@@ -17,6 +17,18 @@ pub(super) fn cell(direction: &Vector3<f64>) -> Option<usize> {
     Some((face * SIDE + along(direction[(axis + 1) % 3])) * SIDE + along(direction[(axis + 2) % 3]))
 }
 
+/// Directions that count in one cell.
+const MAX_IN_CELL: usize = 5;
+
+/// How many these directions are, of each cell up to five: a façade that repeats itself has hundreds in a few.
+pub(super) fn spread<'d>(directions: impl Iterator<Item = &'d Vector3<f64>>) -> usize {
+    let mut cells = [0; CELLS];
+    for cell in directions.filter_map(cell) {
+        cells[cell] = MAX_IN_CELL.min(cells[cell] + 1);
+    }
+    cells.iter().sum()
+}
+
 /// The unit vector through the middle of a cell.
 pub(super) fn centre(cell: usize) -> Vector3<f64> {
     let (face, row, column) = (cell / (SIDE * SIDE), cell / SIDE % SIDE, cell % SIDE);

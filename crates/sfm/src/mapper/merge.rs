@@ -9,6 +9,7 @@
 //! has been adjusted together.
 
 mod crossing;
+mod hung;
 mod likeness;
 mod similarity;
 
@@ -23,6 +24,7 @@ use setloc_features::GuidedParams;
 
 use self::{
     crossing::{Crossing, Sides, distinct, once},
+    hung::Outcome,
     likeness::{Likeness, likeness},
     similarity::Sights,
 };
@@ -42,6 +44,8 @@ use crate::{ImageId, PointId, Rigid, Similarity, robust::RansacParams};
 pub enum MergeVerdict {
     /// They are one now.
     Joined,
+    /// They are one now, by a pair whose length depths tell.
+    Hung,
     /// Too few matches agree on a similarity.
     Unsupported,
     /// The matches that agree leave the scale open.
@@ -90,8 +94,15 @@ pub struct MergeRecord {
 impl MergeRecord {
     /// What was joined and why, in words; `None` when nothing was.
     pub fn sentence(&self) -> Option<String> {
+        let [larger, smaller] = self.images;
+        if self.verdict == MergeVerdict::Hung {
+            return Some(format!(
+                "parts of {larger} and {smaller} images were joined by {} matches of pairs that no third image sees, \
+                 as far apart as what lies beside them says",
+                self.inliers
+            ));
+        }
         (self.verdict == MergeVerdict::Joined).then(|| {
-            let [larger, smaller] = self.images;
             let (found, expected) = (self.found_matches, self.expected_matches);
             let shared = if is_like(found, expected) == Some(false) {
                 format!(
@@ -151,10 +162,8 @@ pub(super) fn join_supported(
     let mut joined_images = BTreeSet::new();
     loop {
         parts.sort_by_key(|part| std::cmp::Reverse(part.size()));
-        let Some((kept, moved, joined)) = first_joined(params, input, &parts, &mut tried, report, seed)
-        else {
-            break;
-        };
+        let found = first_joined(params, input, &parts, Evidence::Matches, &mut tried, report, seed);
+        let Some((kept, moved, Outcome::Joined(joined))) = found else { break };
         joined_images.extend(joined.component.registered());
         parts[kept] = joined;
         parts.remove(moved);
@@ -166,6 +175,40 @@ pub(super) fn join_supported(
     }
     parts.sort_by_key(|part| std::cmp::Reverse(part.size()));
     parts
+}
+
+/// Joins parts of panoramas by single pairs whose length depths tell, largest first; whether any were joined.
+pub(super) fn join_hung(
+    params: &MapperParams,
+    input: &MapperInput<'_>,
+    parts: &mut Vec<Part>,
+    report: &mut MapperReport,
+    seed: u64,
+) -> bool {
+    let mut tried = BTreeSet::new();
+    let mut has_joined = false;
+    loop {
+        parts.sort_by_key(|part| std::cmp::Reverse(part.size()));
+        let found = first_joined(params, input, parts, Evidence::Depths, &mut tried, report, seed);
+        let Some((kept, moved, outcome)) = found else { break };
+        match outcome {
+            Outcome::Joined(joined) => {
+                parts[kept] = joined;
+                parts.remove(moved);
+                has_joined = true;
+            }
+            Outcome::Strangers(strangers) => {
+                let mut apart = parts[moved].clone();
+                let others: Vec<ImageId> =
+                    apart.component.registered().filter(|image| !strangers.contains(image)).collect();
+                apart.leave_out(&others);
+                parts[moved].leave_out(&strangers);
+                parts.push(apart);
+                parts.retain(|part| part.size() >= 2);
+            }
+        }
+    }
+    has_joined
 }
 
 /// The images of all parts but these.
@@ -182,14 +225,24 @@ pub(super) fn taken_by_others(input: &MapperInput<'_>, parts: &[Part], but: &[us
 /// What tells a part from all others and from itself before it grew: its first image and its size.
 type PartState = (Option<ImageId>, usize);
 
+/// What parts are joined by.
+#[derive(Debug, Clone, Copy)]
+enum Evidence {
+    /// A similarity that many matches between them support.
+    Matches,
+    /// A pair, and depths beside what it sees.
+    Depths,
+}
+
 fn first_joined(
     params: &MapperParams,
     input: &MapperInput<'_>,
     parts: &[Part],
+    by: Evidence,
     tried: &mut BTreeSet<[PartState; 2]>,
     report: &mut MapperReport,
     seed: u64,
-) -> Option<(usize, usize, Part)> {
+) -> Option<(usize, usize, Outcome)> {
     let models: Vec<OnceCell<Model<'_>>> = parts.iter().map(|_| OnceCell::new()).collect();
     let model = |at: usize| models[at].get_or_init(|| Model::of_component(input, &parts[at].component));
     for (kept, larger) in parts.iter().enumerate() {
@@ -200,8 +253,12 @@ fn first_joined(
             let taken = taken_by_others(input, parts, &[kept, moved]);
             let sides = Sides { kept: model(kept), moved: model(moved) };
             let attempt = Attempt { params, kept: larger, moved: smaller, sides, seed };
-            if let Some(joined) = attempt.run(taken, report) {
-                return Some((kept, moved, joined));
+            let outcome = match by {
+                Evidence::Matches => attempt.run(taken, report).map(Outcome::Joined),
+                Evidence::Depths => attempt.run_hung(taken, &mut report.merges),
+            };
+            if let Some(outcome) = outcome {
+                return Some((kept, moved, outcome));
             }
         }
     }
@@ -265,14 +322,11 @@ impl<'a> Attempt<'_, '_, 'a> {
                 verdicts[best] = if rival { MergeVerdict::Ambiguous } else { MergeVerdict::Contradicted };
             }
         }
-        let of_part = |part: &Part| part.component.registered().next().unwrap_or(ImageId(0));
         let best_found = hypotheses.get(best);
         let seen = best_found.map(|hypothesis| hypothesis.seen).unwrap_or_default();
         let likeness = best_found.map(|hypothesis| hypothesis.likeness).unwrap_or_default();
+        let verdict = verdicts.get(best).copied().unwrap_or(MergeVerdict::Unsupported);
         report.merges.push(MergeRecord {
-            first_images: [of_part(self.kept), of_part(self.moved)],
-            images: [self.kept.size(), self.moved.size()],
-            verdict: verdicts.get(best).copied().unwrap_or(MergeVerdict::Unsupported),
             candidates,
             inliers: best_found.map_or(0, |hypothesis| hypothesis.support),
             expected: seen.map(|seen| seen.expected),
@@ -281,10 +335,29 @@ impl<'a> Attempt<'_, '_, 'a> {
             matched_cells: seen.map(|seen| seen.matched_cells),
             expected_matches: likeness.expected,
             found_matches: likeness.matched,
+            ..self.record(verdict)
         });
         let mut mapper = joined?;
         report.registrations.append(&mut mapper.records);
         Some(mapper.into_part())
+    }
+
+    /// What became of the two, with nothing said of why.
+    fn record(&self, verdict: MergeVerdict) -> MergeRecord {
+        let first_of = |part: &Part| part.component.registered().next().unwrap_or(ImageId(0));
+        MergeRecord {
+            first_images: [first_of(self.kept), first_of(self.moved)],
+            images: [self.kept.size(), self.moved.size()],
+            verdict,
+            candidates: 0,
+            inliers: 0,
+            expected: [0; 2],
+            matched: [0; 2],
+            expected_cells: [0; 2],
+            matched_cells: [0; 2],
+            expected_matches: 0.0,
+            found_matches: 0.0,
+        }
     }
 
     fn ransac(&self) -> RansacParams {
@@ -591,13 +664,7 @@ impl<'a> Attempt<'_, '_, 'a> {
 
     /// The joined component, unless the adjustment of both together contradicts the similarity.
     fn join(&self, hypothesis: &Hypothesis, taken: Vec<bool>) -> Option<Mapper<'a>> {
-        let input = self.sides.kept.input;
-        let components = [&self.kept.component, &self.moved.component];
-        let model =
-            Model::of_components(input, components[0], components[1], &hypothesis.kept_from_moved, &taken);
-        let mut mapper = Mapper::over(self.params, model, taken, self.seed);
-        let anchors = self.kept.anchors.iter().zip(&self.moved.anchors);
-        mapper.anchors = anchors.map(|(of_kept, of_moved)| of_kept.or(*of_moved)).collect();
+        let mut mapper = self.mapper_over(&hypothesis.kept_from_moved, taken);
         let limits = self.params.limits();
         for _ in 0..2 {
             for crossing in &hypothesis.agreeing {
@@ -615,20 +682,43 @@ impl<'a> Attempt<'_, '_, 'a> {
             mapper.refine(2, 20);
         }
         mapper.replace_misplaced();
-        let stays = |image: ImageId| mapper.model.is_registered(image);
-        let all_stay = components.iter().all(|component| component.registered().all(stays));
-        all_stay.then_some(mapper)
+        self.all_stay(&mapper).then_some(mapper)
+    }
+
+    /// The model of both, that images may join but those that are taken.
+    fn joint(&self, kept_from_moved: &Similarity, taken: &[bool]) -> Model<'a> {
+        let components = [&self.kept.component, &self.moved.component];
+        Model::of_components(self.sides.kept.input, components[0], components[1], kept_from_moved, taken)
+    }
+
+    fn mapper_over(&self, kept_from_moved: &Similarity, taken: Vec<bool>) -> Mapper<'a> {
+        let model = self.joint(kept_from_moved, &taken);
+        let mut mapper = Mapper::over(self.params, model, taken, self.seed);
+        let anchors = self.kept.anchors.iter().zip(&self.moved.anchors);
+        mapper.anchors = anchors.map(|(of_kept, of_moved)| of_kept.or(*of_moved)).collect();
+        mapper
+    }
+
+    /// Whether all images of both are still in the whole.
+    fn all_stay(&self, mapper: &Mapper<'_>) -> bool {
+        [self.kept, self.moved]
+            .iter()
+            .all(|part| part.component.registered().all(|image| mapper.model.is_registered(image)))
+    }
+
+    /// Whether the adjusted whole keeps what either component saw.
+    fn keeps_points(&self, model: &Model<'_>) -> bool {
+        [self.sides.kept, self.sides.moved].into_iter().all(|side| {
+            let count =
+                |of: &Model<'_>| side.registered().map(|image| of.observed_points(image)).sum::<usize>();
+            count(model) as f64 >= MIN_KEPT_OBSERVATIONS * count(side) as f64
+        })
     }
 
     /// Whether the adjusted whole keeps what either component knew and what holds them together.
     fn holds(&self, mapper: &Mapper<'_>) -> bool {
         let model = &mapper.model;
         let sides = [self.sides.kept, self.sides.moved];
-        let keeps = |side: &Model<'_>| {
-            let count =
-                |of: &Model<'_>| side.registered().map(|image| of.observed_points(image)).sum::<usize>();
-            count(model) as f64 >= MIN_KEPT_OBSERVATIONS * count(side) as f64
-        };
         let ties = model
             .live_points()
             .filter(|(_, point)| {
@@ -651,7 +741,7 @@ impl<'a> Attempt<'_, '_, 'a> {
         let pose = |image: ImageId| model.poses[image.index()].map(|pose| pose.world_from_camera);
         let recognized =
             || recognizes(self.sides.moved, self.sides.kept) && recognizes(self.sides.kept, self.sides.moved);
-        sides.into_iter().all(keeps)
+        self.keeps_points(model)
             && ties >= self.params.min_registration_inliers
             && !self.is_contradicted(model)
             && mapper.first_misplaced(&all).is_none()

@@ -19,8 +19,6 @@ use crate::{ImageId, Rigid};
 const MIN_PAIRS_AVERAGED: usize = 5;
 /// The same as a share of all.
 const SHARE_AVERAGED: f64 = 0.05;
-/// Matches that count in one direction, a 96th of the sphere: a façade that repeats itself has hundreds in a few.
-const MAX_IN_CELL: usize = 5;
 /// Share of what neighbours have in common from which two images stand as near as neighbours.
 const NEAR_SHARE: f64 = 0.5;
 /// Fewest matches of neighbours, counted so, that mean something: a few lie on the circles of any pose. Rendered streets
@@ -37,7 +35,7 @@ const MIN_SHARED_WITH_ONE: f64 = 0.5;
 pub(super) struct Neighbours {
     pub images: [ImageId; 2],
     log_distance: f64,
-    /// Matches that lie on the epipolar circles, of each direction up to [`MAX_IN_CELL`].
+    /// Matches that lie on the epipolar circles, by [`direction::spread`].
     matches: f64,
 }
 
@@ -56,16 +54,13 @@ pub(super) fn neighbours<'r>(
             let ((first, first_rays), (second, second_rays)) = (placed(pair.first)?, placed(pair.second)?);
             let distance = (first.translation - second.translation).norm();
             let rays = [first_rays, second_rays];
-            let mut cells = [0; direction::CELLS];
-            for m in on_circles(rays, &(second.inverse() * first), &pair.matches, max_error_sigma) {
-                if let Some(cell) = direction::cell(&first_rays.bearings[m.first as usize]) {
-                    cells[cell] = MAX_IN_CELL.min(cells[cell] + 1);
-                }
-            }
+            let second_from_first = second.inverse() * first;
+            let on_circles = on_circles(rays, &second_from_first, &pair.matches, max_error_sigma);
+            let matches = direction::spread(on_circles.map(|m| &first_rays.bearings[m.first as usize]));
             (distance > 0.0).then(|| Neighbours {
                 images: [pair.first, pair.second],
                 log_distance: distance.ln(),
-                matches: cells.iter().sum::<usize>() as f64,
+                matches: matches as f64,
             })
         })
         .collect()

@@ -3,7 +3,7 @@ use setloc_features::{GuidedParams, match_guided};
 
 use super::{correspondence::CorrespondenceGraph, direction, model::Model};
 use crate::{
-    ImageId, Observation, PointId, Rigid, TwoViewKind,
+    BaselineLength, ImageId, Observation, PointId, Rigid, TwoViewKind,
     robust::{RansacParams, estimate_absolute_pose, refine_absolute_pose},
     solvers::{essential::essential_from_pose, triangulation::length_along},
     visibility::{is_in_image, is_same_view},
@@ -18,6 +18,31 @@ pub(super) struct PoseHypothesis {
     /// 2D-to-3D matches it was chosen from.
     pub candidates: usize,
     pub visibility: Visibility,
+    /// The length of the baseline that holds it, where points do not tell it.
+    pub length: Option<BaselineLength>,
+}
+
+impl PoseHypothesis {
+    /// A pose with those of the 2D-to-3D matches that agree with it.
+    pub fn at(
+        model: &Model<'_>,
+        graph: &CorrespondenceGraph,
+        image: ImageId,
+        world_from_camera: Rigid,
+        max_error_sigma: f64,
+    ) -> Self {
+        let matches = scene_matches(model, graph, image);
+        let rays = &model.rays[image.index()];
+        let agrees = |&(feature, id): &(u32, PointId)| {
+            let Some(point) = model.point(id) else { return false };
+            let direction = world_from_camera.inverse_transform_point(&point.position).normalize();
+            let error = (direction - rays.bearings[feature as usize]).norm();
+            error <= max_error_sigma * rays.sigmas[feature as usize]
+        };
+        let inliers: Vec<(u32, PointId)> = matches.iter().copied().filter(agrees).collect();
+        let visibility = visibility(model, image, &world_from_camera, &inliers);
+        Self { world_from_camera, inliers, candidates: matches.len(), visibility, length: None }
+    }
 }
 
 /// How much of what the image ought to see from here was matched.
@@ -133,6 +158,7 @@ pub(super) fn hypothesize(
             inliers,
             candidates,
             visibility,
+            length: None,
         });
     }
     hypotheses
@@ -210,6 +236,7 @@ pub(super) fn hypothesize_from_pairs(
                 inliers,
                 candidates: matches.len(),
                 visibility,
+                length: None,
             });
         }
     }
@@ -282,7 +309,8 @@ pub(super) fn hypothesize_baseline(
     let inliers: Vec<(u32, PointId)> =
         agreeing(length).into_iter().map(|at| (candidates[at].0, candidates[at].1)).collect();
     let visibility = visibility(model, image, &found, &inliers);
-    Some(PoseHypothesis { world_from_camera: found, inliers, candidates: candidates.len(), visibility })
+    let candidates = candidates.len();
+    Some(PoseHypothesis { world_from_camera: found, inliers, candidates, visibility, length: None })
 }
 
 /// Points in plain view that make a direction worth judging.
@@ -359,6 +387,7 @@ pub(super) fn is_in_view(
 /// Registers an image at an accepted pose: its inliers become observations.
 pub(super) fn register(model: &mut Model<'_>, image: ImageId, hypothesis: &PoseHypothesis) {
     model.set_pose(image, Some(hypothesis.world_from_camera));
+    model.lengths.extend(hypothesis.length);
     for &(feature, id) in &hypothesis.inliers {
         let observation = Observation { image, feature };
         let free = model.point_of(observation).is_none()

@@ -4,9 +4,11 @@
 //! Their directions are wrong, and most of the matches of a right pair miss the epipolar circles of the place that a wrong one
 //! gives. One pair may be wrong with more matches than many a right one has, so they are weighed against each other.
 
-use std::collections::BTreeMap;
+use std::{cmp::Reverse, collections::BTreeMap};
 
-use super::{model::Model, witnesses::count_agreeing};
+use setloc_features::Match;
+
+use super::{direction, model::Model, witnesses::count_agreeing};
 use crate::{ImageId, PairGeometry, Rigid};
 
 /// Share of a pair's verified matches on the epipolar circles of a pose from which the pair is for that pose.
@@ -16,6 +18,12 @@ const MIN_PAIRS_FOR: usize = 2;
 /// How many times more matches the pairs for a pose must have than the strongest pair against it, and how many times fewer they
 /// may have than the strongest pair with an image that waits: that of a room with another panorama of the room.
 const LEAD: usize = 2;
+/// Spread of the most spread pair for a pose from which nothing else is asked of what they see: of wrong pairs in rendered floors
+/// and streets nine tenths have less than 53, the most spread one 148, the next 82.
+const STRONG_SPREAD: usize = 80;
+/// Largest share of wrong pairs among those of a model that are as spread as a pair, or more, for that pair to be believed by
+/// itself.
+const MAX_WRONG: f64 = 0.1;
 
 /// What the verified pairs of an image say of a pose.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -30,6 +38,15 @@ pub(super) struct Support {
     pub elsewhere: usize,
     /// Matches of the strongest pair with an image that waits, too, and says nothing yet.
     pub waiting: usize,
+    /// How spread the matches of the pairs for it are ([`direction::spread`]), all together.
+    pub spread: usize,
+    /// The same of the most spread pair for it. All pairs across two streets may be of one façade, of which more of them show no
+    /// more, and a room that stands twice has all its pairs twice.
+    pub widest: usize,
+    /// The same of the most spread pair that is against it, with an image of the model or of another large part.
+    pub spread_against: usize,
+    /// The same of the most spread pair with an image that waits.
+    pub spread_waiting: usize,
 }
 
 impl Support {
@@ -37,6 +54,18 @@ impl Support {
     pub fn is_enough(&self, min_matches: usize) -> bool {
         let asked = (LEAD * self.against.max(self.elsewhere)).max(self.waiting / LEAD);
         self.pairs >= MIN_PAIRS_FOR && self.matches >= min_matches.max(asked)
+    }
+
+    /// Whether one of the pairs for it leaves few directions out, so that no copy of a part of its surroundings explains it.
+    pub fn is_strong(&self) -> bool {
+        self.widest >= STRONG_SPREAD
+    }
+
+    /// Whether it may be taken by what even one pair says, if such pairs are right.
+    pub fn is_enough_if_right(&self) -> bool {
+        self.pairs > 0
+            && self.spread >= LEAD * self.spread_against
+            && LEAD * self.widest >= self.spread_waiting
     }
 
     /// How many times more matches the strongest pair against it has than all that are for it.
@@ -79,46 +108,212 @@ impl Support {
             ask(model, |pair| pair.seen_from(image).is_some(), pose, max_error_sigma)
         {
             let partner = if first == image { second } else { first };
-            if said.agreeing > 0 {
-                support.pairs += 1;
-                support.matches += said.agreeing;
+            if said.agreeing.matches > 0 {
+                support.add(said.agreeing);
             } else if model.is_registered(partner) {
-                support.against = support.against.max(said.refused);
+                support.against = support.against.max(said.refused.matches);
+                support.spread_against = support.spread_against.max(said.refused.spread);
             } else if taken[partner.index()] {
-                support.elsewhere = support.elsewhere.max(said.refused);
+                support.elsewhere = support.elsewhere.max(said.refused.matches);
+                support.spread_against = support.spread_against.max(said.refused.spread);
             } else {
-                support.waiting = support.waiting.max(said.refused);
+                support.waiting = support.waiting.max(said.refused.matches);
+                support.spread_waiting = support.spread_waiting.max(said.refused.spread);
             }
         }
         support
     }
 
+    fn add(&mut self, agreeing: Strength) {
+        self.pairs += 1;
+        self.matches += agreeing.matches;
+        self.spread += agreeing.spread;
+        self.widest = self.widest.max(agreeing.spread);
+    }
+
     /// Asks the pairs between some images of a model and all others.
     pub fn across(model: &Model<'_>, is_inside: impl Fn(ImageId) -> bool, max_error_sigma: f64) -> Self {
-        let crosses = |pair: &PairGeometry| {
-            let ends = [pair.first, pair.second];
-            ends.iter().all(|&image| model.is_registered(image)) && is_inside(ends[0]) != is_inside(ends[1])
-        };
+        let crosses = |pair: &PairGeometry| is_inside(pair.first) != is_inside(pair.second);
+        Self::by(model, crosses, max_error_sigma)
+    }
+
+    /// Asks those pairs between images of a model that `counts` chooses.
+    pub fn by(model: &Model<'_>, counts: impl Fn(&PairGeometry) -> bool, max_error_sigma: f64) -> Self {
         let pose = |of: ImageId| Some(model.poses[of.index()]?.world_from_camera);
+        let is_asked = |pair: &PairGeometry| {
+            [pair.first, pair.second].iter().all(|&image| model.is_registered(image)) && counts(pair)
+        };
+        Self::of_said(ask(model, is_asked, pose, max_error_sigma).values())
+    }
+
+    fn of_said<'s>(all: impl Iterator<Item = &'s PairSays>) -> Self {
         let mut support = Self::default();
-        for said in ask(model, crosses, pose, max_error_sigma).into_values() {
-            if said.agreeing > 0 {
-                support.pairs += 1;
-                support.matches += said.agreeing;
+        for said in all {
+            if said.agreeing.matches > 0 {
+                support.add(said.agreeing);
             } else {
-                support.against = support.against.max(said.refused);
+                support.against = support.against.max(said.refused.matches);
+                support.spread_against = support.spread_against.max(said.refused.spread);
             }
         }
         support
     }
 }
 
-/// Matches of the geometries of one pair: of the strongest that agrees with the poses of both images and of the strongest that
-/// does not.
+/// The few images of a model that the pairs with all others speak most against, together, where that is untenable.
+///
+/// Two panoramas of a room have a strong pair with each other wherever they are put. So not only single images are asked but
+/// what the strongest ties of a model make of them, up to `max_images`. Several pairs that are against a place speak together
+/// where they agree on another: `elsewhere` gives the place of an image that most of its pairs agree on.
+pub(super) fn most_contradicted(
+    model: &Model<'_>,
+    may_leave: impl Fn(ImageId) -> bool,
+    elsewhere: impl Fn(ImageId) -> Option<Rigid>,
+    max_images: usize,
+    max_error_sigma: f64,
+) -> Option<Vec<ImageId>> {
+    let pose = |of: ImageId| Some(model.poses[of.index()]?.world_from_camera);
+    let is_inside = |pair: &PairGeometry| [pair.first, pair.second].iter().all(|&of| model.is_registered(of));
+    let said = ask(model, is_inside, pose, max_error_sigma);
+    let mut ties: Vec<(usize, [ImageId; 2])> =
+        said.iter().map(|(images, said)| (said.agreeing.matches, *images)).collect();
+    ties.retain(|(matches, _)| *matches > 0);
+    ties.sort_unstable_by_key(|&(matches, images)| (Reverse(matches), images));
+    let mut group_of: Vec<usize> = (0..model.poses.len()).collect();
+    let mut groups: Vec<Vec<ImageId>> = model.registered().map(|image| vec![image]).collect();
+    for (_, images) in ties {
+        let [into, from] = images.map(|image| group_of[image.index()]);
+        if into == from {
+            continue;
+        }
+        let members = || model.registered().filter(|image| [into, from].contains(&group_of[image.index()]));
+        if members().nth(max_images).is_none() {
+            groups.push(members().collect());
+        }
+        group_of.iter_mut().filter(|of| **of == from).for_each(|of| *of = into);
+    }
+    let mut most: Option<(f64, Vec<ImageId>)> = None;
+    for group in groups.into_iter().filter(|group| group.iter().all(|&image| may_leave(image))) {
+        let crosses = |images: &&[ImageId; 2]| group.contains(&images[0]) != group.contains(&images[1]);
+        let across = said.iter().filter(|(images, _)| crosses(images)).map(|(_, said)| said);
+        let mut support = Support::of_said(across);
+        if (LEAD * support.against) as f64 > support.matches as f64 && !support.is_untenable() {
+            let other_places = group.iter().filter_map(|&image| {
+                let place = elsewhere(image)?;
+                Some(matches_for_another_place(model, &group, image, &place, max_error_sigma))
+            });
+            support.against = other_places.max().unwrap_or(0).max(support.against);
+        }
+        let contradiction = support.contradiction();
+        if support.is_untenable() && most.as_ref().is_none_or(|(most, _)| contradiction > *most) {
+            most = Some((contradiction, group));
+        }
+    }
+    most.map(|(_, group)| group)
+}
+
+/// Matches of the pairs of an image with those beyond its group that are for another place of it and not for its own.
+fn matches_for_another_place(
+    model: &Model<'_>,
+    group: &[ImageId],
+    image: ImageId,
+    place: &Rigid,
+    max_error_sigma: f64,
+) -> usize {
+    let counts = |pair: &PairGeometry| {
+        let other = pair.seen_from(image).map(|(other, _)| other);
+        other.is_some_and(|other| model.is_registered(other) && !group.contains(&other))
+    };
+    let current = |of: ImageId| Some(model.poses[of.index()]?.world_from_camera);
+    let other = |of: ImageId| if of == image { Some(*place) } else { current(of) };
+    let now = ask(model, counts, current, max_error_sigma);
+    let there = ask(model, counts, other, max_error_sigma);
+    let is_moot = |images: &[ImageId; 2]| now.get(images).is_some_and(|said| said.agreeing.matches > 0);
+    there.iter().filter(|(images, _)| !is_moot(images)).map(|(_, said)| said.agreeing.matches).sum()
+}
+
+/// How far pairs are to be believed by themselves: what those of a model are worth, whose poses tell which are right.
+///
+/// In a house without repeated things all of 36 pairs are right, in a rendered floor of equal tiles and pictures a third of 305;
+/// but of those whose matches spread over many directions nearly all are.
+#[derive(Debug)]
+pub(super) struct Worth {
+    /// How spread each pair is, and whether it is right; the most spread first.
+    known: Vec<(usize, bool)>,
+}
+
+impl Worth {
+    /// Of the pairs between images of one of these models.
+    pub fn of(models: &[&Model<'_>], max_error_sigma: f64) -> Self {
+        let of_model = |model: &&Model<'_>| -> Vec<(usize, bool)> {
+            let known = |pair: &PairGeometry| {
+                let pose = |of: ImageId| Some(model.poses[of.index()]?.world_from_camera);
+                let second_from_first = pose(pair.second)?.inverse() * pose(pair.first)?;
+                Some((spread(model, pair), is_for(model, pair, &second_from_first, max_error_sigma)))
+            };
+            model.input.pairs.iter().filter_map(known).collect()
+        };
+        let mut known: Vec<(usize, bool)> = models.iter().flat_map(of_model).collect();
+        known.sort_unstable_by_key(|&(spread, is_right)| (Reverse(spread), is_right));
+        Self { known }
+    }
+
+    /// Whether pairs that are so spread are right, by Laplace's rule of succession; those that are more spread are so no less
+    /// often than those that are less.
+    pub fn believes(&self, spread: usize) -> bool {
+        let (mut all, mut wrong) = (0, 0);
+        let mut are_right = |more: &[(usize, bool)]| {
+            all += more.len();
+            wrong += more.iter().filter(|(_, is_right)| !is_right).count();
+            (wrong + 1) as f64 <= MAX_WRONG * (all + 2) as f64
+        };
+        let (as_spread, less) =
+            self.known.split_at(self.known.partition_point(|(of_pair, _)| *of_pair >= spread));
+        are_right(as_spread) || less.chunk_by(|a, b| a.0 == b.0).any(are_right)
+    }
+}
+
+/// The spread of a pair's verified matches in that of its two images in which they are less spread; images of other parts have
+/// no rays and are not asked.
+fn spread(model: &Model<'_>, pair: &PairGeometry) -> usize {
+    let spread_in = |image: ImageId, feature: fn(&Match) -> u32| {
+        let bearings = &model.rays[image.index()].bearings;
+        let seen = pair.two_view.inliers.iter().filter_map(|m| bearings.get(feature(m) as usize));
+        (!bearings.is_empty()).then(|| direction::spread(seen))
+    };
+    let spreads = [spread_in(pair.first, |m| m.first), spread_in(pair.second, |m| m.second)];
+    spreads.into_iter().flatten().min().unwrap_or(0)
+}
+
+/// Whether a pair is for a relative pose of its images.
+pub(super) fn is_for(
+    model: &Model<'_>,
+    pair: &PairGeometry,
+    second_from_first: &Rigid,
+    max_error_sigma: f64,
+) -> bool {
+    let agreeing = count_agreeing(model, pair, pair.second, second_from_first, max_error_sigma);
+    agreeing as f64 >= MIN_FOR * pair.two_view.inliers.len() as f64
+}
+
+/// What a pair weighs.
+#[derive(Debug, Clone, Copy, Default)]
+struct Strength {
+    matches: usize,
+    spread: usize,
+}
+
+impl Strength {
+    fn max(self, other: Self) -> Self {
+        Self { matches: self.matches.max(other.matches), spread: self.spread.max(other.spread) }
+    }
+}
+
+/// The geometries of one pair: the strongest that agrees with the poses of both images and the strongest that does not.
 #[derive(Debug, Default)]
 struct PairSays {
-    agreeing: usize,
-    refused: usize,
+    agreeing: Strength,
+    refused: Strength,
 }
 
 /// What those pairs say that `counts` chooses; without a pose nothing agrees.
@@ -130,15 +325,13 @@ fn ask(
 ) -> BTreeMap<[ImageId; 2], PairSays> {
     let mut said: BTreeMap<[ImageId; 2], PairSays> = BTreeMap::new();
     for pair in model.input.pairs.iter().filter(|pair| counts(pair)) {
-        let matches = pair.two_view.inliers.len();
-        let agrees = pose(pair.first).zip(pose(pair.second)).is_some_and(|(first, second)| {
-            let second_from_first = second.inverse() * first;
-            let agreeing = count_agreeing(model, pair, pair.second, &second_from_first, max_error_sigma);
-            agreeing as f64 >= MIN_FOR * matches as f64
-        });
+        let agrees = pose(pair.first)
+            .zip(pose(pair.second))
+            .is_some_and(|(first, second)| is_for(model, pair, &(second.inverse() * first), max_error_sigma));
         let said = said.entry([pair.first, pair.second]).or_default();
+        let strength = Strength { matches: pair.two_view.inliers.len(), spread: spread(model, pair) };
         let most = if agrees { &mut said.agreeing } else { &mut said.refused };
-        *most = matches.max(*most);
+        *most = most.max(strength);
     }
     said
 }
@@ -159,7 +352,7 @@ mod tests {
     #[test]
     fn one_pair_or_a_strong_contradiction_is_not_enough() {
         let enough = |pairs, matches, against, waiting| {
-            Support { pairs, matches, against, waiting, elsewhere: 0 }.is_enough(50)
+            Support { pairs, matches, against, waiting, ..Support::default() }.is_enough(50)
         };
         assert!(enough(2, 300, 150, 0) && enough(2, 300, 0, 600));
         assert!(!enough(1, 300, 0, 0) && !enough(2, 49, 0, 0));
@@ -175,6 +368,44 @@ mod tests {
         assert!(of(2, 188, 271).is_contradicted() && !of(2, 188, 271).is_untenable());
         assert!(of(1, 59, 735).is_untenable() && of(0, 0, 20).is_untenable());
         assert!(!Support::default().is_contradicted());
+    }
+
+    #[test]
+    fn pairs_are_believed_by_what_those_as_spread_or_less_are_worth() {
+        let worth = |known: &[(usize, bool)]| Worth { known: known.to_vec() };
+        let all_right: Vec<(usize, bool)> = (0..9).map(|at| (60 - at, true)).collect();
+        assert!(worth(&all_right[..8]).believes(20) && worth(&all_right[..8]).believes(52));
+        assert!(!worth(&all_right[..7]).believes(20), "too few to tell");
+        // What less spread pairs are worth, those that are more spread are, too.
+        assert!(worth(&all_right).believes(59));
+        let mixed = [all_right, vec![(40, false), (39, true), (38, false)]].concat();
+        assert!(worth(&mixed).believes(41) && !worth(&mixed).believes(40) && !worth(&mixed).believes(38));
+        assert!(!worth(&[]).believes(1000));
+    }
+
+    #[test]
+    fn two_that_belong_together_are_contradicted_together() {
+        // The third and the fourth image have a strong pair with each other, and stand aside.
+        let mut street = Street::new("together", 60, POINTS);
+        street.stand_again(2);
+        let input = street.input();
+        let mut model = Model::new(&input);
+        let place = |model: &mut Model<'_>, aside: f64| {
+            let step = Vector3::new(aside, 0.0, aside);
+            for (image, pose) in street.poses.iter().enumerate() {
+                let step = if image >= 2 { step } else { Vector3::zeros() };
+                let pose = Rigid::new(pose.rotation, pose.translation + step);
+                model.set_pose(ImageId(image as u32), Some(pose));
+            }
+        };
+        let may_leave = |image: ImageId| image >= ImageId(2);
+        let contradicted =
+            |model: &Model<'_>, most: usize| most_contradicted(model, may_leave, |_| None, most, SIGMAS);
+        place(&mut model, 3.0);
+        assert_eq!(contradicted(&model, 2), Some(vec![ImageId(2), ImageId(3)]));
+        assert_eq!(contradicted(&model, 1), None);
+        place(&mut model, 0.0);
+        assert_eq!(contradicted(&model, 2), None);
     }
 
     #[test]
@@ -219,7 +450,9 @@ mod tests {
             let world_from_camera =
                 Rigid::new(truth.rotation, truth.translation + Vector3::new(aside, 0.0, 0.0));
             let visibility = Visibility { expected: 0, matched: 0, expected_cells: 0, matched_cells: 0 };
-            let pose = PoseHypothesis { world_from_camera, inliers: Vec::new(), candidates: 20, visibility };
+            let inliers = Vec::new();
+            let pose =
+                PoseHypothesis { world_from_camera, inliers, candidates: 20, visibility, length: None };
             mapper.first_accepted(ImageId(2), vec![pose], &mut false, &mut Vec::new()).is_some()
         };
         assert!(accepts(0.0) && !accepts(2.0));

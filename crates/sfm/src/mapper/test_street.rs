@@ -17,6 +17,7 @@ pub(super) const POINTS: usize = 160;
 
 pub(super) struct Street {
     camera: Camera,
+    points: Vec<Vector3<f64>>,
     features: Vec<ImageFeatures>,
     pairs: Vec<PairGeometry>,
     pub poses: Vec<Rigid>,
@@ -56,18 +57,9 @@ impl Street {
             features
         };
         let features: Vec<ImageFeatures> = poses.iter().map(features_of).collect();
-        let pair = |first: usize, second: usize, matches: usize| PairGeometry {
-            first: ImageId(first as u32),
-            second: ImageId(second as u32),
-            two_view: TwoView {
-                kind: TwoViewKind::General,
-                second_from_first: poses[second].inverse() * poses[first],
-                inliers: (0..matches as u32).map(|at| Match { first: at, second: at }).collect(),
-                median_parallax_rad: 0.5,
-            },
-        };
-        let pairs = vec![pair(0, 1, POINTS), pair(0, 2, with_first), pair(1, 2, with_second)];
-        Self { camera, features, pairs, poses }
+        let pairs =
+            vec![pair(&poses, 0, 1, POINTS), pair(&poses, 0, 2, with_first), pair(&poses, 1, 2, with_second)];
+        Self { camera, points, features, pairs, poses }
     }
 
     pub fn input(&self) -> MapperInput<'_> {
@@ -82,12 +74,40 @@ impl Street {
         }
     }
 
+    /// Adds a panorama a step from one of the three, with which it shares all points, and with no other any.
+    pub fn stand_again(&mut self, image: usize) {
+        let pose = self.poses[image];
+        let pose = Rigid::new(pose.rotation, pose.translation + Vector3::new(0.5, 0.0, 1.0));
+        let mut features = self.features[image].clone();
+        for (keypoint, point) in features.keypoints.iter_mut().zip(&self.points) {
+            let pixel = self.camera.project(&pose.inverse_transform_point(point)).expect("sees all around");
+            [keypoint.x, keypoint.y] = [pixel.x, pixel.y].map(|at| at as f32);
+        }
+        self.poses.push(pose);
+        self.pairs.push(pair(&self.poses, image, self.poses.len() - 1, POINTS));
+        self.features.push(features);
+    }
+
     pub fn graph(&self) -> CorrespondenceGraph {
         CorrespondenceGraph::build(&[POINTS; 3], &self.pairs, &vec![true; self.pairs.len()])
     }
 
     pub fn features_mut(&mut self, image: usize) -> &mut ImageFeatures {
         &mut self.features[image]
+    }
+}
+
+/// The right pair of two images that match the first points.
+fn pair(poses: &[Rigid], first: usize, second: usize, matches: usize) -> PairGeometry {
+    PairGeometry {
+        first: ImageId(first as u32),
+        second: ImageId(second as u32),
+        two_view: TwoView {
+            kind: TwoViewKind::General,
+            second_from_first: poses[second].inverse() * poses[first],
+            inliers: (0..matches as u32).map(|at| Match { first: at, second: at }).collect(),
+            median_parallax_rad: 0.5,
+        },
     }
 }
 
