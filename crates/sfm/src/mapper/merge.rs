@@ -30,6 +30,7 @@ use self::{
 };
 use super::{
     Mapper, MapperInput, MapperParams, MapperReport, Part,
+    depths::is_indoors,
     model::Model,
     neighbours::{Neighbours, neighbours, share_as_neighbours},
     register::{Visibility, visibility, visibility_beside},
@@ -246,6 +247,9 @@ fn first_joined(
     let models: Vec<OnceCell<Model<'_>>> = parts.iter().map(|_| OnceCell::new()).collect();
     let model = |at: usize| models[at].get_or_init(|| Model::of_component(input, &parts[at].component));
     for (kept, larger) in parts.iter().enumerate() {
+        if matches!(by, Evidence::Depths) && !is_indoors(model(kept)) {
+            continue;
+        }
         for (moved, smaller) in parts.iter().enumerate().skip(kept + 1) {
             if !tried.insert([larger.state(), smaller.state()]) {
                 continue;

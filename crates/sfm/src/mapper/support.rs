@@ -172,6 +172,9 @@ pub(super) fn most_contradicted(
     max_images: usize,
     max_error_sigma: f64,
 ) -> Option<Vec<ImageId>> {
+    if !model.registered().any(&may_leave) {
+        return None;
+    }
     let pose = |of: ImageId| Some(model.poses[of.index()]?.world_from_camera);
     let is_inside = |pair: &PairGeometry| [pair.first, pair.second].iter().all(|&of| model.is_registered(of));
     let said = ask(model, is_inside, pose, max_error_sigma);

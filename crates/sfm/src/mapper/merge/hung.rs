@@ -7,7 +7,7 @@
 use super::{
     super::{
         Mapper,
-        depths::{self, is_indoors, stands_on_floor},
+        depths::{self, stands_on_floor},
         model::Model,
         structure::{complete_and_merge, triangulate_image},
         support::{Support, Worth},
@@ -42,9 +42,6 @@ impl<'a> Attempt<'_, '_, 'a> {
     pub fn run_hung(&self, taken: Vec<bool>, records: &mut Vec<MergeRecord>) -> Option<Outcome> {
         let sides = [self.sides.kept, self.sides.moved];
         if !sides.iter().all(|side| side.registered().all(|image| side.input.is_panoramic(image))) {
-            return None;
-        }
-        if !is_indoors(self.sides.kept) {
             return None;
         }
         let hung = self.best_hung(&taken)?;
