@@ -1168,6 +1168,9 @@ impl<'a> Mapper<'a> {
 
     /// Whether an image may hang at a pose by one pair whose length depths tell.
     fn may_hang(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        if !self.admits_by_depths {
+            return false;
+        }
         let sigmas = self.params.max_error_sigma;
         let support = self.support(image, world_from_camera);
         let is_at_home = || {
@@ -1175,8 +1178,7 @@ impl<'a> Mapper<'a> {
                 || self.shares_with_one(image, world_from_camera)
                 || stands_on_floor(&self.model, image, world_from_camera, sigmas)
         };
-        self.admits_by_depths
-            && support.is_enough_if_right()
+        support.is_enough_if_right()
             && Worth::of(&[&self.model], sigmas).believes(support.widest)
             && is_at_home()
     }
@@ -1250,7 +1252,8 @@ impl<'a> Mapper<'a> {
     /// Takes out images that do not see what their neighbours in the model see.
     ///
     /// An image that came in through a repeated façade (the initial pair too) is found out once the true surroundings
-    /// of the place have been mapped, or by pairs that speak against it. It is offered again when more of the model can be matched to it.
+    /// of the place have been mapped, or by pairs that speak against it. It is offered again when more of the model can be
+    /// matched to it.
     fn expel_misplaced(&mut self) -> usize {
         let mut expelled = 0;
         let mut waiting: Vec<ImageId> = self.model.registered().collect();

@@ -272,7 +272,7 @@ fn lengths_note((component, model): (usize, &Reconstruction), names: &[String]) 
     }
     Some(format!(
         "distances{} rest on what lies beside the points of one pair and on the floor, not on points that a third \
-         panorama sees (± {least:.0} to {most:.0} %): {}",
+         image sees (± {least:.0} to {most:.0} %): {}",
         of_component(component),
         steps.join(", ")
     ))

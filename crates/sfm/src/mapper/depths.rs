@@ -33,8 +33,6 @@ use crate::{
 const MAX_DEPTH_SIGMA: f64 = 0.15;
 /// Largest angle between two directions whose depths are compared.
 const SIDE_BY_SIDE_RAD: f64 = 0.1;
-/// Points of the model that each match is compared with, the nearest ones.
-const COMPARED: usize = 1;
 /// How much the logarithm of a depth changes with the direction, as a standard deviation: that of a wall seen at 45°, and of
 /// the floor at most.
 const SLOPE: f64 = 1.0;
@@ -71,7 +69,7 @@ const LEAST_DEVIATION: f64 = 0.01;
 
 /// How far it is in a direction.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Depth {
+struct Depth {
     /// Unit vector in the frame of the camera.
     direction: Vector3<f64>,
     /// Logarithm of the depth.
@@ -99,7 +97,7 @@ impl Depth {
 }
 
 /// The depths of the points that an image of a model sees.
-pub(super) fn of_points(model: &Model<'_>, image: ImageId) -> Vec<Depth> {
+fn of_points(model: &Model<'_>, image: ImageId) -> Vec<Depth> {
     let Some(pose) = &model.poses[image.index()] else { return Vec::new() };
     let depth =
         |point: &SeenPoint| Depth::of((pose.camera_from_world * point.position).try_normalize(0.0)?, point);
@@ -107,7 +105,7 @@ pub(super) fn of_points(model: &Model<'_>, image: ImageId) -> Vec<Depth> {
 }
 
 /// The depths of matches as the first of two images sees them, where the second is at distance one.
-pub(super) fn of_pair(rays: [&Rays; 2], second_from_first: &Rigid, matches: &[Match]) -> Vec<Depth> {
+fn of_pair(rays: [&Rays; 2], second_from_first: &Rigid, matches: &[Match]) -> Vec<Depth> {
     let first_from_second = second_from_first.inverse();
     let Some(step) = first_from_second.translation.try_normalize(0.0) else { return Vec::new() };
     let second_pose = Rigid::new(first_from_second.rotation, step);
@@ -138,7 +136,7 @@ pub(super) struct Floor {
 }
 
 /// The floor below an image, by the drops of what it sees that most agree on; `None` unless one stands out.
-pub(super) fn floor(known: &[Depth]) -> Option<Floor> {
+fn floor(known: &[Depth]) -> Option<Floor> {
     let drops: Vec<Opinion> = known
         .iter()
         .filter_map(|depth| Some(Opinion { length: depth.drop()?, sigma: depth.sigma.hypot(UNEVEN) }))
@@ -150,27 +148,25 @@ pub(super) fn floor(known: &[Depth]) -> Option<Floor> {
 
 /// A length that depths agree on.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Found {
+struct Found {
     /// In units of the known depths.
-    pub length: f64,
+    length: f64,
     /// Standard deviation of its logarithm.
-    pub deviation: f64,
+    deviation: f64,
     /// Matches that agree.
-    pub votes: usize,
+    votes: usize,
 }
 
 /// The length of the baseline of a pair by what its first image knows beside its matches; `None` unless one length stands out.
-pub(super) fn length(known: &[Depth], floor: Option<Floor>, of_pair: &[Depth]) -> Option<Found> {
+fn length(known: &[Depth], floor: Option<Floor>, of_pair: &[Depth]) -> Option<Found> {
     let mut opinions = Vec::new();
     let mut matches = Vec::new();
     for (at, of_match) in of_pair.iter().enumerate() {
-        let mut near: Vec<(f64, &Depth)> = known
+        let beside = known
             .iter()
             .map(|depth| ((depth.direction - of_match.direction).norm(), depth))
-            .filter(|(chord, _)| *chord <= SIDE_BY_SIDE_RAD)
-            .collect();
-        near.sort_by(|a, b| a.0.total_cmp(&b.0));
-        for (chord, depth) in near.into_iter().take(COMPARED) {
+            .min_by(|a, b| a.0.total_cmp(&b.0));
+        if let Some((chord, depth)) = beside.filter(|(chord, _)| *chord <= SIDE_BY_SIDE_RAD) {
             let sigma = of_match.sigma.hypot(depth.sigma).hypot(of_match.slope() * chord + RELIEF);
             if sigma <= MAX_DEPTH_SIGMA {
                 opinions.push(Opinion { length: depth.log - of_match.log, sigma });
@@ -198,9 +194,13 @@ pub(super) fn length(known: &[Depth], floor: Option<Floor>, of_pair: &[Depth]) -
 }
 
 /// The floor below the images of a model that see theirs, where they stand alike above it.
-fn floor_of_all(model: &Model<'_>) -> Option<Floor> {
-    let floors: Vec<f64> =
-        model.registered().filter_map(|image| Some(floor(&of_points(model, image))?.drop)).collect();
+pub(super) fn floor_of_all(model: &Model<'_>) -> Option<Floor> {
+    common_floor(model.registered().map(|image| of_points(model, image)))
+}
+
+/// The floor below images that know these depths, where they stand alike above it.
+fn common_floor(known: impl Iterator<Item = Vec<Depth>>) -> Option<Floor> {
+    let floors: Vec<f64> = known.filter_map(|known| Some(floor(&known)?.drop)).collect();
     let drop = median(floors.clone())?;
     let sigma = median(floors.iter().map(|of_image| (of_image - drop).abs()).collect())?;
     (floors.len() >= MIN_FLOORS && sigma <= UNEVEN).then_some(Floor {
@@ -215,18 +215,19 @@ fn floor_of_all(model: &Model<'_>) -> Option<Floor> {
 ///
 /// Depths beside are as good as walls are near. In a rendered street of 9 m steps they put panoramas 1 m off.
 pub(super) fn is_indoors(model: &Model<'_>) -> bool {
-    let in_each_direction = |image: ImageId| {
+    let in_each_direction = |known: &Vec<Depth>| {
         let mut cells: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
-        for depth in of_points(model, image) {
+        for depth in known {
             if let Some(cell) = direction::cell(&depth.direction) {
                 cells.entry(cell).or_default().push(depth.log);
             }
         }
         cells.into_values().filter_map(median)
     };
-    let depths = model.registered().flat_map(in_each_direction).collect();
+    let known: Vec<Vec<Depth>> = model.registered().map(|image| of_points(model, image)).collect();
+    let depths = known.iter().flat_map(in_each_direction).collect();
     let is_near = |(floor, depth): (Floor, f64)| depth - floor.drop <= MAX_HEIGHTS.ln();
-    floor_of_all(model).zip(median(depths)).is_some_and(is_near)
+    common_floor(known.into_iter()).zip(median(depths)).is_some_and(is_near)
 }
 
 /// Whether the matches of the pairs that are for a pose of an image lie on the floor, those that are well below the horizon, if
@@ -246,9 +247,7 @@ pub(super) fn stands_on_floor(
         let Some((other, _)) = pair.seen_from(image) else { continue };
         let Some(pose) = &model.poses[other.index()] else { continue };
         let other_from_image = pose.world_from_camera.inverse() * *world_from_camera;
-        let second_from_first =
-            if pair.first == image { other_from_image } else { other_from_image.inverse() };
-        if !is_for(model, pair, &second_from_first, max_error_sigma) {
+        if !is_for(model, pair, other, &other_from_image, max_error_sigma) {
             continue;
         }
         let rays = [image, other].map(|image| &model.rays[image.index()]);
@@ -263,9 +262,10 @@ pub(super) fn stands_on_floor(
 }
 
 /// The step from an image of a model to another one by their verified pair and what the first knows beside its matches, in
-/// units of the model.
+/// units of the model; `of_all` is the floor below all its images.
 pub(super) fn step(
     model: &Model<'_>,
+    of_all: Option<Floor>,
     [from, to]: [ImageId; 2],
     rays_of_to: &Rays,
     to_from_from: &Rigid,
@@ -277,7 +277,7 @@ pub(super) fn step(
     let rays = [&model.rays[from.index()], rays_of_to];
     let known = of_points(model, from);
     let own = floor(&known);
-    let floor = own.filter(|floor| floor.points >= MANY_FLOOR_POINTS).or_else(|| floor_of_all(model)).or(own);
+    let floor = own.filter(|floor| floor.points >= MANY_FLOOR_POINTS).or(of_all).or(own);
     let found = length(&known, floor, &of_pair(rays, to_from_from, matches))?;
     let from_from_to = to_from_from.inverse();
     let along = from_from_to.translation.try_normalize(0.0)? * found.length;

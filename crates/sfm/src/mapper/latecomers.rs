@@ -119,14 +119,20 @@ pub(super) fn hypothesize_from_depths(
     image: ImageId,
     max_error_sigma: f64,
 ) -> Option<PoseHypothesis> {
+    let floor = depths::floor_of_all(model);
     let mut best: Option<(usize, Rigid, BaselineLength)> = None;
     for pair in pairs_with(model, image).into_iter().take(CROSSED_PAIRS) {
         let Some((other, image_from_other)) = pair.seen_from(image) else { continue };
         let Some(world_from_other) = &model.poses[other.index()] else { continue };
         let matches = pair.matches_from(other);
-        let Some((step, length)) =
-            depths::step(model, [other, image], &model.rays[image.index()], &image_from_other, &matches)
-        else {
+        let Some((step, length)) = depths::step(
+            model,
+            floor,
+            [other, image],
+            &model.rays[image.index()],
+            &image_from_other,
+            &matches,
+        ) else {
             continue;
         };
         let pose = world_from_other.world_from_camera * step;

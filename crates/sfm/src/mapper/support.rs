@@ -252,7 +252,8 @@ impl Worth {
             let known = |pair: &PairGeometry| {
                 let pose = |of: ImageId| Some(model.poses[of.index()]?.world_from_camera);
                 let second_from_first = pose(pair.second)?.inverse() * pose(pair.first)?;
-                Some((spread(model, pair), is_for(model, pair, &second_from_first, max_error_sigma)))
+                let is_right = is_for(model, pair, pair.second, &second_from_first, max_error_sigma);
+                Some((spread(model, pair), is_right))
             };
             model.input.pairs.iter().filter_map(known).collect()
         };
@@ -288,14 +289,15 @@ fn spread(model: &Model<'_>, pair: &PairGeometry) -> usize {
     spreads.into_iter().flatten().min().unwrap_or(0)
 }
 
-/// Whether a pair is for a relative pose of its images.
+/// Whether a pair is for a pose of `image`, one of the two, relative to the other.
 pub(super) fn is_for(
     model: &Model<'_>,
     pair: &PairGeometry,
-    second_from_first: &Rigid,
+    image: ImageId,
+    image_from_other: &Rigid,
     max_error_sigma: f64,
 ) -> bool {
-    let agreeing = count_agreeing(model, pair, pair.second, second_from_first, max_error_sigma);
+    let agreeing = count_agreeing(model, pair, image, image_from_other, max_error_sigma);
     agreeing as f64 >= MIN_FOR * pair.two_view.inliers.len() as f64
 }
 
@@ -328,9 +330,9 @@ fn ask(
 ) -> BTreeMap<[ImageId; 2], PairSays> {
     let mut said: BTreeMap<[ImageId; 2], PairSays> = BTreeMap::new();
     for pair in model.input.pairs.iter().filter(|pair| counts(pair)) {
-        let agrees = pose(pair.first)
-            .zip(pose(pair.second))
-            .is_some_and(|(first, second)| is_for(model, pair, &(second.inverse() * first), max_error_sigma));
+        let agrees = pose(pair.first).zip(pose(pair.second)).is_some_and(|(first, second)| {
+            is_for(model, pair, pair.second, &(second.inverse() * first), max_error_sigma)
+        });
         let said = said.entry([pair.first, pair.second]).or_default();
         let strength = Strength { matches: pair.two_view.inliers.len(), spread: spread(model, pair) };
         let most = if agrees { &mut said.agreeing } else { &mut said.refused };

@@ -7,7 +7,7 @@
 use super::{
     super::{
         Mapper,
-        depths::{self, stands_on_floor},
+        depths::{self, Floor, floor_of_all, stands_on_floor},
         model::Model,
         structure::{complete_and_merge, triangulate_image},
         support::{Support, Worth},
@@ -74,8 +74,9 @@ impl<'a> Attempt<'_, '_, 'a> {
             .filter(|pair| pair.two_view.kind != TwoViewKind::PureRotation && self.crosses(pair))
             .collect();
         pairs.sort_by_key(|pair| std::cmp::Reverse(pair.two_view.inliers.len()));
-        let suggested: Vec<_> =
-            pairs.into_iter().take(LOCAL_PAIRS).filter_map(|pair| self.by_pair(pair)).collect();
+        let floors = [self.sides.kept, self.sides.moved].map(floor_of_all);
+        let by_pair = |pair| self.by_pair(pair, floors);
+        let suggested: Vec<_> = pairs.into_iter().take(LOCAL_PAIRS).filter_map(by_pair).collect();
         let mut joint = self.joint(&suggested.first()?.0, taken);
         let mut best: Option<Hung> = None;
         for (kept_from_moved, lengths) in suggested {
@@ -116,21 +117,25 @@ impl<'a> Attempt<'_, '_, 'a> {
         is_in(self.sides.kept) && is_in(self.sides.moved)
     }
 
-    /// The similarity by a pair across, with its length in both parts.
-    fn by_pair(&self, pair: &PairGeometry) -> Option<(Similarity, [BaselineLength; 2])> {
+    /// The similarity by a pair across, with its length in both parts, below whose images these floors are.
+    fn by_pair(
+        &self,
+        pair: &PairGeometry,
+        [kept_floor, moved_floor]: [Option<Floor>; 2],
+    ) -> Option<(Similarity, [BaselineLength; 2])> {
         let (kept, moved) = (self.sides.kept, self.sides.moved);
         let (of_kept, of_moved) = if kept.is_registered(pair.first) {
             (pair.first, pair.second)
         } else {
             (pair.second, pair.first)
         };
-        let step = |model: &Model<'_>, from: ImageId, to: ImageId, to_side: &Model<'_>| {
+        let step = |model: &Model<'_>, floor, from: ImageId, to: ImageId, to_side: &Model<'_>| {
             let (_, to_from_from) = pair.seen_from(to)?;
             let rays = &to_side.rays[to.index()];
-            depths::step(model, [from, to], rays, &to_from_from, &pair.matches_from(from))
+            depths::step(model, floor, [from, to], rays, &to_from_from, &pair.matches_from(from))
         };
-        let (kept_step, kept_length) = step(kept, of_kept, of_moved, moved)?;
-        let (moved_step, moved_length) = step(moved, of_moved, of_kept, kept)?;
+        let (kept_step, kept_length) = step(kept, kept_floor, of_kept, of_moved, moved)?;
+        let (moved_step, moved_length) = step(moved, moved_floor, of_moved, of_kept, kept)?;
         let pose = |model: &Model<'_>, image: ImageId| Some(model.poses[image.index()]?.world_from_camera);
         let in_kept = pose(kept, of_kept)? * kept_step;
         let in_moved = pose(moved, of_moved)?;
