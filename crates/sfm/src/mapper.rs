@@ -16,6 +16,7 @@ mod merge;
 mod model;
 mod nearby;
 mod neighbours;
+mod parts;
 pub(crate) mod plane;
 mod projection;
 mod register;
@@ -57,11 +58,11 @@ use self::{
     divide::divide,
     latecomers::{
         FEW_IMAGES, best_crossing, count_held_by_pairs, hypothesize_from_crossings, hypothesize_from_depths,
-        may_be_left,
     },
     lens::choose_lenses,
     model::Model,
     neighbours::{Neighbours, neighbours, share_as_neighbours, share_with_one},
+    parts::{Anchors, Part, Parts},
     projection::search_by_projection,
     register::{
         PoseHypothesis, Visibility, count_scene_matches, hypothesize, hypothesize_baseline,
@@ -77,7 +78,7 @@ use self::{
 };
 use crate::{
     BaselineLength, CameraId, Georegistration, ImageId, Observation, OutvotedPair, PairGeometry, PointId,
-    Reconstruction, ReconstructionImage, Rigid, TwoViewKind, TwoViewParams,
+    Reconstruction, Rigid, TwoViewKind, TwoViewParams,
     bundle::{BundleParams, RobustLoss},
     robust::RansacParams,
 };
@@ -420,221 +421,19 @@ fn reconstruct_with(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -
     let Some(underfoot) = Underfoot::find(input) else { return output };
     let Some((rest, warning)) = underfoot.better_input(&output.components, seed) else { return output };
     let bare = MapperInput { pairs: &rest.pairs, putative: &rest.putative, ..input.clone() };
-    let (parts, mut report) = map_parts(params, &bare, seed);
-    report.warnings.push(warning);
-    let pairs = underfoot.borne_out(&parts);
+    let mut parts = Parts::map(params, &bare, seed);
+    parts.report.warnings.push(warning);
+    let pairs = underfoot.borne_out(&parts.all);
     let input = MapperInput { pairs: &pairs, ..input.clone() };
-    let parts = grow_again(params, &input, parts, &underfoot.witnesses(&pairs), &mut report, seed);
-    finished(params, &input, parts, report, seed)
+    let witnesses = underfoot.witnesses(&pairs);
+    let mut parts = parts.over(&input);
+    parts.grow_again(&witnesses);
+    parts.finished()
 }
 
 fn reconstruct_images(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
-    let (parts, report) = map_parts(params, input, seed);
-    finished(params, input, parts, report, seed)
+    Parts::map(params, input, seed).finished()
 }
-
-/// All components, largest first, and those that a similarity is supported between as one.
-fn map_parts(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> (Vec<Part>, MapperReport) {
-    let mut report = MapperReport::default();
-    let mut parts: Vec<Part> = Vec::new();
-    let mut taken = vec![false; input.images.len()];
-    let mut barren = vec![false; input.images.len()];
-    while let Some(mut mapper) = Mapper::new(params, input, taken.clone(), seed) {
-        let found = mapper.initialize(&mut barren);
-        if found {
-            mapper.grow();
-            mapper.finish();
-        }
-        report.registrations.append(&mut mapper.records);
-        if !found || mapper.model.registered_count() < 2 {
-            break;
-        }
-        for image in mapper.model.registered() {
-            taken[image.index()] = true;
-        }
-        parts.push(mapper.into_part());
-    }
-    let parts = merge::join_supported(params, input, parts, &mut report, seed);
-    let mut parts = admit_latecomers(params, input, parts, &mut report, seed);
-    while params.join_by_depths && merge::join_hung(params, input, &mut parts, &mut report, seed) {
-        parts = admit_latecomers(params, input, parts, &mut report, seed);
-    }
-    (parts, report)
-}
-
-/// The parts with the images that only their pairs and what they share with neighbours speak for, largest first.
-///
-/// Images may leave parts of hardly any images, or that their pairs speak against, for a larger one. Only of panoramas is it
-/// known what neighbours share, so nothing changes without any.
-fn admit_latecomers(
-    params: &MapperParams,
-    input: &MapperInput<'_>,
-    mut parts: Vec<Part>,
-    report: &mut MapperReport,
-    seed: u64,
-) -> Vec<Part> {
-    if !(0..input.images.len() as u32).any(|image| input.is_panoramic(ImageId(image))) {
-        return parts;
-    }
-    let mut at = 0;
-    while at < parts.len() {
-        let is_open = |other: &usize| *other == at || may_be_left(input, &parts[*other]);
-        let open: Vec<usize> = (0..parts.len()).filter(is_open).collect();
-        let taken = merge::taken_by_others(input, &parts, &open);
-        let part = &parts[at];
-        let waits =
-            |(image, taken): (&ReconstructionImage, &bool)| image.world_from_camera.is_none() && !taken;
-        if may_be_left(input, part) || !part.component.images.iter().zip(&taken).any(waits) {
-            at += 1;
-            continue;
-        }
-        let mut mapper = Mapper::over(params, Model::open(input, &part.component, &taken), taken, seed);
-        mapper.anchors.clone_from(&part.anchors);
-        mapper.admit_latecomers();
-        mapper.grow();
-        let has_grown = mapper.model.registered_count() > part.size();
-        if has_grown {
-            mapper.finish();
-        }
-        report.registrations.append(&mut mapper.records);
-        if has_grown {
-            parts[at] = mapper.into_part();
-            let admitted: Vec<ImageId> = parts[at].component.registered().collect();
-            for (_, other) in parts.iter_mut().enumerate().filter(|(other, _)| *other != at) {
-                other.leave_out(&admitted);
-            }
-            parts.retain(|part| part.size() >= 2);
-        }
-        at += 1;
-    }
-    parts.sort_by_key(|part| Reverse(part.size()));
-    parts
-}
-
-/// The parts with what pairs add to them that they were not made of, largest first; witnesses judge who joins.
-fn grow_again(
-    params: &MapperParams,
-    input: &MapperInput<'_>,
-    mut parts: Vec<Part>,
-    witnesses: &Witnesses,
-    report: &mut MapperReport,
-    seed: u64,
-) -> Vec<Part> {
-    for at in 0..parts.len() {
-        rework(params, input, &mut parts, at, report, seed, |mapper| {
-            mapper.witnesses = Some(witnesses);
-            mapper.refine(2, 20);
-            mapper.grow();
-            mapper.finish();
-        });
-    }
-    parts.sort_by_key(|part| Reverse(part.component.registered().count()));
-    parts
-}
-
-/// Opens one of the parts to images that no other has, and puts what work makes of it in its place.
-fn rework<'a>(
-    params: &'a MapperParams,
-    input: &'a MapperInput<'a>,
-    parts: &mut [Part],
-    at: usize,
-    report: &mut MapperReport,
-    seed: u64,
-    work: impl FnOnce(&mut Mapper<'a>),
-) {
-    let taken = merge::taken_by_others(input, parts, &[at]);
-    let part = &parts[at];
-    let mut mapper = Mapper::over(params, Model::open(input, &part.component, &taken), taken, seed);
-    mapper.anchors.clone_from(&part.anchors);
-    work(&mut mapper);
-    report.registrations.append(&mut mapper.records);
-    parts[at] = mapper.into_part();
-}
-
-/// The parts as they are handed over.
-fn finished(
-    params: &MapperParams,
-    input: &MapperInput<'_>,
-    parts: Vec<Part>,
-    mut report: MapperReport,
-    seed: u64,
-) -> MapperOutput {
-    let mut components = Vec::new();
-    for part in parts {
-        let (component, unheld) = seen_again(params, input, part, seed).without_unheld();
-        for image in unheld {
-            let name = &component.images[image.index()].name;
-            report.warnings.push(format!("{name} is left out: next to no point of the model holds it"));
-        }
-        components.push(component);
-    }
-    // Images that were left out may change which is the largest.
-    let size = |component: &Reconstruction| component.registered().count();
-    components.retain(|component| size(component) >= 2);
-    components.sort_by_key(|component| Reverse(size(component)));
-    MapperOutput { components, report, ..MapperOutput::default() }
-}
-
-/// The part with further observations of its points, where images have few.
-///
-/// Not before parts are joined: what they ought to share is measured by what the ratio test finds within each.
-fn seen_again(params: &MapperParams, input: &MapperInput<'_>, part: Part, seed: u64) -> Part {
-    if !projection::has_images_with_few_points(&part.component) {
-        return part;
-    }
-    let model = Model::of_component(input, &part.component);
-    let taken = part.component.images.iter().map(|image| image.world_from_camera.is_none()).collect();
-    let mut mapper = Mapper::over(params, model, taken, seed);
-    mapper.anchors.clone_from(&part.anchors);
-    if mapper.see_again() { mapper.into_part() } else { part }
-}
-
-/// The image that each image was turned from, and the turn, where it entered so.
-type Anchors = Vec<Option<(ImageId, UnitQuaternion<f64>)>>;
-
-/// A finished component with what its images are held by.
-#[derive(Clone)]
-struct Part {
-    component: Reconstruction,
-    anchors: Anchors,
-}
-
-impl Part {
-    /// The component without the poses of images that fewer than [`MIN_HELD_POINTS`] points hold, and these images.
-    ///
-    /// Points that later disagreed are gone then, and the pose is where it was when they did not; photos matched with
-    /// such an image were localized at wrong places. Images that were turned from another one are held by it.
-    fn without_unheld(mut self) -> (Reconstruction, Vec<ImageId>) {
-        let mut points_of = vec![0_usize; self.component.images.len()];
-        for seen in self.component.points.iter().flat_map(|point| &point.track) {
-            points_of[seen.image.index()] += 1;
-        }
-        let is_turned = |image: ImageId| (self.anchors.iter().flatten()).any(|(from, _)| *from == image);
-        let held = |image: ImageId| {
-            points_of[image.index()] >= MIN_HELD_POINTS
-                || self.anchors[image.index()].is_some()
-                || is_turned(image)
-                || self.component.lengths.iter().any(|length| length.involves(image))
-        };
-        let unheld: Vec<ImageId> = self.component.registered().filter(|image| !held(*image)).collect();
-        self.leave_out(&unheld);
-        (self.component, unheld)
-    }
-
-    /// Takes the poses of images and what they see.
-    fn leave_out(&mut self, images: &[ImageId]) {
-        for image in images {
-            self.component.images[image.index()].world_from_camera = None;
-            for point in &mut self.component.points {
-                point.track.retain(|seen| seen.image != *image);
-            }
-        }
-        self.component.points.retain(|point| point.track.len() >= 2);
-    }
-}
-
-/// Fewest points that hold an image: three give a pose, a fourth contradicts a wrong one.
-const MIN_HELD_POINTS: usize = 4;
 
 /// The pairs of which no image is taken.
 fn enabled_pairs(input: &MapperInput<'_>, taken: &[bool]) -> Vec<bool> {
@@ -1409,7 +1208,7 @@ mod tests {
     use super::test_street::{POINTS, Street, first_two};
     use super::*;
     use crate::synthetic::seeded;
-    use crate::{ReconstructionImage, ReconstructionPoint, TwoView, TwoViewKind};
+    use crate::{ReconstructionImage, TwoView, TwoViewKind};
 
     /// The other two images agree, so nothing but the third one's own matches can turn it.
     #[test]
@@ -1529,38 +1328,5 @@ mod tests {
         assert_eq!(ends(output.open_among(&pairs)), [(1, 2), (3, 0), (2, 3), (3, 9)]);
         // The third image has a place already, if in another component.
         assert_eq!(ends(output.waiting_among(&pairs)), [(3, 0), (2, 3)]);
-    }
-
-    #[test]
-    fn images_that_next_to_no_point_holds_lose_their_pose_and_others_keep_theirs() {
-        let image = |number: u32| ReconstructionImage {
-            name: number.to_string(),
-            camera: CameraId(0),
-            world_from_camera: Some(Rigid::new(UnitQuaternion::identity(), Vector3::x() * f64::from(number))),
-        };
-        let point = |feature: u32, images: &[u32]| ReconstructionPoint {
-            position: Vector3::z(),
-            color: [0; 3],
-            error_sigma: 1.0,
-            covariance: None,
-            track: images.iter().map(|&image| Observation { image: ImageId(image), feature }).collect(),
-            aligned: None,
-        };
-        // Three points hold the third image, none the fourth, which was turned from the first.
-        let points = (0..6).map(|feature| point(feature, if feature < 2 { &[0, 1, 2] } else { &[0, 1] }));
-        let points: Vec<_> = points.chain([point(6, &[1, 2])]).collect();
-        let component = Reconstruction {
-            cameras: vec![Camera::equirectangular(200, 100)],
-            images: (0..4).map(image).collect(),
-            points,
-            lengths: Vec::new(),
-        };
-        let mut anchors = vec![None; 4];
-        anchors[3] = Some((ImageId(0), UnitQuaternion::identity()));
-        let (component, unheld) = Part { component, anchors }.without_unheld();
-        assert_eq!(unheld, [ImageId(2)]);
-        assert_eq!(component.registered().collect::<Vec<_>>(), [0, 1, 3].map(ImageId));
-        assert_eq!(component.points.len(), 6);
-        assert!(component.points.iter().all(|point| point.track.len() == 2));
     }
 }

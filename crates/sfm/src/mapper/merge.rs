@@ -29,12 +29,12 @@ use self::{
     similarity::Sights,
 };
 use super::{
-    Mapper, MapperInput, MapperParams, MapperReport, Part,
+    Mapper, MapperParams, MapperReport,
     depths::is_indoors,
     model::Model,
     neighbours::{Neighbours, neighbours, share_as_neighbours},
+    parts::{Part, Parts},
     register::{Visibility, visibility, visibility_beside},
-    rework,
     structure::{complete_and_merge, connect},
     support::Support,
 };
@@ -149,78 +149,88 @@ const MAX_POSITION_ERROR_SHARE: f64 = 0.3;
 /// Smallest share of each component's own observations that the adjustment of both together must keep.
 const MIN_KEPT_OBSERVATIONS: f64 = 0.9;
 
-/// Joins components, largest first, as long as a similarity between two of them is supported. Returns them by size.
-///
-/// A whole is finished when nothing more joins it: that takes far longer than all else about a join.
-pub(super) fn join_supported(
-    params: &MapperParams,
-    input: &MapperInput<'_>,
-    mut parts: Vec<Part>,
-    report: &mut MapperReport,
-    seed: u64,
-) -> Vec<Part> {
-    let mut tried = BTreeSet::new();
-    let mut joined_images = BTreeSet::new();
-    loop {
-        parts.sort_by_key(|part| std::cmp::Reverse(part.size()));
-        let found = first_joined(params, input, &parts, Evidence::Matches, &mut tried, report, seed);
-        let Some((kept, moved, Outcome::Joined(joined))) = found else { break };
-        joined_images.extend(joined.component.registered());
-        parts[kept] = joined;
-        parts.remove(moved);
-    }
-    for at in 0..parts.len() {
-        if parts[at].component.registered().any(|image| joined_images.contains(&image)) {
-            rework(params, input, &mut parts, at, report, seed, Mapper::finish);
+impl Parts<'_> {
+    /// Joins parts, largest first, as long as a similarity between two of them is supported.
+    ///
+    /// A whole is finished when nothing more joins it: that takes far longer than all else about a join.
+    pub fn join_supported(&mut self) {
+        let mut tried = BTreeSet::new();
+        let mut joined_images = BTreeSet::new();
+        loop {
+            self.sort();
+            let found = self.first_joined(Evidence::Matches, &mut tried);
+            let Some((kept, moved, Outcome::Joined(joined))) = found else { break };
+            joined_images.extend(joined.component.registered());
+            self.all[kept] = joined;
+            self.all.remove(moved);
         }
-    }
-    parts.sort_by_key(|part| std::cmp::Reverse(part.size()));
-    parts
-}
-
-/// Joins parts of panoramas by single pairs whose length depths tell, largest first; whether any were joined.
-pub(super) fn join_hung(
-    params: &MapperParams,
-    input: &MapperInput<'_>,
-    parts: &mut Vec<Part>,
-    report: &mut MapperReport,
-    seed: u64,
-) -> bool {
-    let mut tried = BTreeSet::new();
-    let mut has_joined = false;
-    loop {
-        parts.sort_by_key(|part| std::cmp::Reverse(part.size()));
-        let found = first_joined(params, input, parts, Evidence::Depths, &mut tried, report, seed);
-        let Some((kept, moved, outcome)) = found else { break };
-        match outcome {
-            Outcome::Joined(joined) => {
-                parts[kept] = joined;
-                parts.remove(moved);
-                has_joined = true;
-            }
-            Outcome::Strangers(strangers) => {
-                let mut apart = parts[moved].clone();
-                let others: Vec<ImageId> =
-                    apart.component.registered().filter(|image| !strangers.contains(image)).collect();
-                apart.leave_out(&others);
-                parts[moved].leave_out(&strangers);
-                parts.push(apart);
-                parts.retain(|part| part.size() >= 2);
+        for at in 0..self.all.len() {
+            if self.all[at].component.registered().any(|image| joined_images.contains(&image)) {
+                self.rework(at, Mapper::finish);
             }
         }
+        self.sort();
     }
-    has_joined
-}
 
-/// The images of all parts but these.
-pub(super) fn taken_by_others(input: &MapperInput<'_>, parts: &[Part], but: &[usize]) -> Vec<bool> {
-    let mut taken = vec![false; input.images.len()];
-    for (_, other) in parts.iter().enumerate().filter(|(at, _)| !but.contains(at)) {
-        for image in other.component.registered() {
-            taken[image.index()] = true;
+    /// Joins parts of panoramas by single pairs whose length depths tell, largest first; whether any were joined.
+    pub fn join_hung(&mut self) -> bool {
+        let mut tried = BTreeSet::new();
+        let mut has_joined = false;
+        loop {
+            self.sort();
+            let Some((kept, moved, outcome)) = self.first_joined(Evidence::Depths, &mut tried) else { break };
+            match outcome {
+                Outcome::Joined(joined) => {
+                    self.all[kept] = joined;
+                    self.all.remove(moved);
+                    has_joined = true;
+                }
+                Outcome::Strangers(strangers) => {
+                    let mut apart = self.all[moved].clone();
+                    let others: Vec<ImageId> =
+                        apart.component.registered().filter(|image| !strangers.contains(image)).collect();
+                    apart.leave_out(&others);
+                    self.all[moved].leave_out(&strangers);
+                    self.all.push(apart);
+                    self.all.retain(|part| part.size() >= 2);
+                }
+            }
         }
+        has_joined
     }
-    taken
+
+    /// What comes of the first two parts that something comes of, and which these are.
+    fn first_joined(
+        &mut self,
+        by: Evidence,
+        tried: &mut BTreeSet<[PartState; 2]>,
+    ) -> Option<(usize, usize, Outcome)> {
+        let (input, parts) = (self.input, &self.all);
+        let models: Vec<OnceCell<Model<'_>>> = parts.iter().map(|_| OnceCell::new()).collect();
+        let model = |at: usize| models[at].get_or_init(|| Model::of_component(input, &parts[at].component));
+        for (kept, larger) in parts.iter().enumerate() {
+            if matches!(by, Evidence::Depths) && !is_indoors(model(kept)) {
+                continue;
+            }
+            for (moved, smaller) in parts.iter().enumerate().skip(kept + 1) {
+                if !tried.insert([larger.state(), smaller.state()]) {
+                    continue;
+                }
+                let taken = self.taken_by_all_but(&[kept, moved]);
+                let sides = Sides { kept: model(kept), moved: model(moved) };
+                let attempt =
+                    Attempt { params: self.params, kept: larger, moved: smaller, sides, seed: self.seed };
+                let outcome = match by {
+                    Evidence::Matches => attempt.run(taken, &mut self.report).map(Outcome::Joined),
+                    Evidence::Depths => attempt.run_hung(taken, &mut self.report.merges),
+                };
+                if let Some(outcome) = outcome {
+                    return Some((kept, moved, outcome));
+                }
+            }
+        }
+        None
+    }
 }
 
 /// What tells a part from all others and from itself before it grew: its first image and its size.
@@ -235,45 +245,7 @@ enum Evidence {
     Depths,
 }
 
-fn first_joined(
-    params: &MapperParams,
-    input: &MapperInput<'_>,
-    parts: &[Part],
-    by: Evidence,
-    tried: &mut BTreeSet<[PartState; 2]>,
-    report: &mut MapperReport,
-    seed: u64,
-) -> Option<(usize, usize, Outcome)> {
-    let models: Vec<OnceCell<Model<'_>>> = parts.iter().map(|_| OnceCell::new()).collect();
-    let model = |at: usize| models[at].get_or_init(|| Model::of_component(input, &parts[at].component));
-    for (kept, larger) in parts.iter().enumerate() {
-        if matches!(by, Evidence::Depths) && !is_indoors(model(kept)) {
-            continue;
-        }
-        for (moved, smaller) in parts.iter().enumerate().skip(kept + 1) {
-            if !tried.insert([larger.state(), smaller.state()]) {
-                continue;
-            }
-            let taken = taken_by_others(input, parts, &[kept, moved]);
-            let sides = Sides { kept: model(kept), moved: model(moved) };
-            let attempt = Attempt { params, kept: larger, moved: smaller, sides, seed };
-            let outcome = match by {
-                Evidence::Matches => attempt.run(taken, report).map(Outcome::Joined),
-                Evidence::Depths => attempt.run_hung(taken, &mut report.merges),
-            };
-            if let Some(outcome) = outcome {
-                return Some((kept, moved, outcome));
-            }
-        }
-    }
-    None
-}
-
 impl Part {
-    pub(super) fn size(&self) -> usize {
-        self.component.registered().count()
-    }
-
     fn state(&self) -> PartState {
         (self.component.registered().next(), self.size())
     }
