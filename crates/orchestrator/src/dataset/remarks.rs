@@ -88,8 +88,14 @@ pub(super) fn warnings_of(images: &[SourceImage], given: &Given<'_>) -> Vec<Stri
     warnings.into_iter().flatten().collect()
 }
 
+/// Panoramas need no cameras: a file of those of photos beside it is no mistake.
 fn cameras_without_image(images: &[SourceImage], cameras: &CameraBook) -> Option<String> {
     let file = cameras.file.as_deref()?;
+    let is_of_others = |name: &str| file.parent().is_some_and(|folder| folder.join(name).is_file());
+    let are_panoramas = images.iter().all(|image| image.camera.is_panoramic());
+    if are_panoramas && cameras.first_name().is_some_and(is_of_others) {
+        return None;
+    }
     let found = images.iter().any(|image| cameras.find(&image.name, &image.path).is_some());
     (!found).then(|| fits_none(file, "the camera", cameras.first_name(), images))
 }
@@ -250,6 +256,9 @@ mod tests {
         );
         assert!(warnings(&cameras(64, 32, "\"p/a.png\": \"c\"")).is_empty());
         assert!(warnings(&cameras(64, 32, ""))[0].contains("it lists none"));
+        std::fs::create_dir(folder.0.path().join("q")).unwrap();
+        folder.write("q/a.png", "a photo");
+        assert!(warnings(&cameras(40, 30, "\"q/a.png\": \"c\"")).is_empty());
     }
 
     #[test]
