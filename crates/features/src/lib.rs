@@ -70,7 +70,7 @@ pub use geodesy::Wgs84;
 pub use mask::Mask;
 pub use matching::{
     DescriptorBlock, Elevations, GuidedParams, Match, MatchParams, Posture, TwoNearest, match_features,
-    match_guided, squared_distance, two_nearest,
+    match_guided, squared_distance, two_nearest, without_carried,
 };
 pub use nearby::NearbyKeypoints;
 pub use patch::{Aligned, ImagePyramid, Patch, PatchFrame, PatchParams, Template};

@@ -3,6 +3,7 @@ mod alike;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+mod carried;
 mod guided;
 mod kernel;
 #[cfg(target_arch = "x86_64")]
@@ -77,7 +78,7 @@ impl MatchParams {
     /// that are worth screening. 5: without the last bit of descriptors; keypoints of level images that are turned alike.
     /// 6: small images are taken for level by their strongest keypoints, too. 7: keypoints of level images that can show the
     /// same by height and size, too.
-    pub const VERSION: u32 = 7;
+    pub const VERSION: u32 = 8;
 
     /// Checks the ranges.
     ///
@@ -185,6 +186,8 @@ impl Elevations {
 /// the ratio test with its own likes of other views. Of matches that say the same (both ends within
 /// 3 pixels) one stays, for they are one piece of evidence: the images' own before a simulated view's, then
 /// the nearer.
+///
+/// Of level images those matches are left out that show what moves with the camera, as a tripod does or a logo over the nadir.
 pub fn match_features(
     params: &MatchParams,
     posture: Posture,
@@ -200,11 +203,25 @@ pub fn match_features(
         }
         strongest = Some(found);
     }
-    let own = match_own(params, posture, first, second, strongest);
+    let own = without_carried(match_own(params, posture, first, second, strongest), posture, first, second);
     if own.len() >= params.simulate_below || (first.simulated.is_empty() && second.simulated.is_empty()) {
         return own;
     }
-    match_simulated(first, second, own, |a, b| match_all(params, (first, a), (second, b)))
+    let all = match_simulated(first, second, own, |a, b| match_all(params, (first, a), (second, b)));
+    without_carried(all, posture, first, second)
+}
+
+/// Matches of two images without those of what moves with the camera.
+pub fn without_carried(
+    matches: Vec<Match>,
+    posture: Posture,
+    first: &ImageFeatures,
+    second: &ImageFeatures,
+) -> Vec<Match> {
+    match posture {
+        Posture::Level(elevations) => carried::without_carried(matches, elevations, first, second),
+        Posture::Any => matches,
+    }
 }
 
 /// Matches two images themselves; `strongest` are matches of their strongest keypoints, if there are more.

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use anyhow::Result;
 use rayon::prelude::*;
 use serde_json::json;
-use setloc_features::ImageFeatures;
+use setloc_features::{Camera, ImageFeatures, without_carried};
 
 use super::model::{add_features_of, features_role};
 use crate::artifacts::LikelyImages;
@@ -56,15 +56,16 @@ impl LikelyJobs {
         let ordered: Vec<SourceImage> = order.iter().map(|&at| images[at].clone()).collect();
         let wanted: Vec<bool> = ordered.iter().map(is_wanted).collect();
         let features = add_features_of(graph, &ordered, features);
+        let cameras: Vec<Camera> = ordered.iter().map(|image| image.camera.clone()).collect();
         let matching = config.matching.clone();
-        let params = json!({ "matching": matching, "strongest": STRONGEST, "alike": most, "wanted": wanted });
+        let params = json!({ "cameras": cameras, "matching": matching, "strongest": STRONGEST, "alike": most, "wanted": wanted });
         let work = move |inputs: &Inputs<'_, '_>| {
             let strongest = (0..wanted.len()).into_par_iter().with_max_len(1).map(|at| {
                 let features = inputs.find::<ImageFeatures>(&features_role(at))?;
                 Ok(features.map(|features| features.strongest(STRONGEST)).unwrap_or_default())
             });
             let strongest: Vec<ImageFeatures> = strongest.collect::<Result<_>>()?;
-            Product::new(LikelyImages(most_alike(&matching, &strongest, &wanted, most)))
+            Product::new(LikelyImages(most_alike(&matching, &strongest, &cameras, &wanted, most)))
         };
         let likely = graph.add(Job {
             kind: "likely",
@@ -108,6 +109,7 @@ impl LikelyJobs {
 fn most_alike(
     matching: &MatchParams,
     images: &[ImageFeatures],
+    cameras: &[Camera],
     wanted: &[bool],
     most: usize,
 ) -> Vec<Vec<u32>> {
@@ -121,8 +123,10 @@ fn most_alike(
             let shared = |b: usize| {
                 let is_asked = wanted[a] || wanted[b];
                 if is_asked {
-                    stages::match_features(&matching, stages::Posture::Any, &images[a], &images[b]).len()
-                        as u32
+                    let posture = stages::Posture::of([&cameras[a], &cameras[b]]);
+                    let (first, second) = (&images[a], &images[b]);
+                    let found = stages::match_features(&matching, stages::Posture::Any, first, second);
+                    without_carried(found, posture, first, second).len() as u32
                 } else {
                     0
                 }
@@ -170,9 +174,11 @@ mod tests {
     #[test]
     fn neighbours_look_most_alike_and_only_who_asks_gets_an_answer() {
         let images = street(6);
-        let found = most_alike(&MatchParams::default(), &images, &[true; 6], 2);
+        let cameras = vec![Camera::equirectangular(100, 50); 6];
+        let found = most_alike(&MatchParams::default(), &images, &cameras, &[true; 6], 2);
         assert_eq!(found, [vec![1], vec![0, 2], vec![1, 3], vec![2, 4], vec![3, 5], vec![4]]);
-        let one = most_alike(&MatchParams::default(), &images, &[false, false, true, false, false, false], 1);
+        let wanted = [false, false, true, false, false, false];
+        let one = most_alike(&MatchParams::default(), &images, &cameras, &wanted, 1);
         assert_eq!(one, [vec![], vec![], vec![1], vec![], vec![], vec![]]);
     }
 
