@@ -84,7 +84,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 44;
+pub const MAPPER_VERSION: u32 = 45;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -960,9 +960,13 @@ impl<'a> Mapper<'a> {
 
     /// Whether an image may come in late at a pose.
     fn is_latecomer(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
-        self.admits_latecomers
-            && self.support(image, world_from_camera).is_enough(self.params.min_initial_points)
-            && self.shares_with_one(image, world_from_camera)
+        if !self.admits_latecomers {
+            return false;
+        }
+        let support = self.support(image, world_from_camera);
+        let is_believed = || Worth::of(&[&self.model], self.params.max_error_sigma).believes(support.widest);
+        support.is_enough(self.params.min_initial_points)
+            && (support.is_strong() && is_believed() || self.shares_with_one(image, world_from_camera))
     }
 
     /// Whether an image may hang at a pose by one pair whose length depths tell.

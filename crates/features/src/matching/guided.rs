@@ -4,8 +4,9 @@ use std::ops::Range;
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::kernel::{TwoNearest, squared_distance};
+use super::kernel::TwoNearest;
 use super::{Match, Parts, collect, match_simulated, passes};
+use crate::vectorized::{Level, vectorized};
 use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Rays};
 
 /// How to match two images of known relative pose.
@@ -50,6 +51,36 @@ pub fn match_guided(
     second: (&ImageFeatures, &Rays),
     second_from_first: &Matrix3<f64>,
 ) -> Vec<Match> {
+    match_where(params, first, second, second_from_first, None)
+}
+
+/// Those matches of [`match_guided`] of which one keypoint at least is needed: far faster where few are.
+///
+/// `needed` says of each keypoint of the first and of the second image whether it is.
+pub fn match_guided_among(
+    params: &GuidedParams,
+    first: (&ImageFeatures, &Rays),
+    second: (&ImageFeatures, &Rays),
+    second_from_first: &Matrix3<f64>,
+    needed: [&[bool]; 2],
+) -> Vec<Match> {
+    let is_needed = |m: &Match| needed[0][m.first as usize] || needed[1][m.second as usize];
+    // Which of a simulated view's matches repeats another is told by all of them.
+    let has_views = !(first.0.simulated.is_empty() && second.0.simulated.is_empty());
+    let asked = (!has_views).then_some(needed);
+    let mut matches = match_where(params, first, second, second_from_first, asked);
+    matches.retain(is_needed);
+    matches
+}
+
+/// All matches, or of those of which no keypoint is needed any.
+fn match_where(
+    params: &GuidedParams,
+    first: (&ImageFeatures, &Rays),
+    second: (&ImageFeatures, &Rays),
+    second_from_first: &Matrix3<f64>,
+    needed: Option<[&[bool]; 2]>,
+) -> Vec<Match> {
     if [first.0, second.0]
         .iter()
         .any(|features| features.descriptors.len() != features.len() * DESCRIPTOR_LEN)
@@ -60,7 +91,8 @@ pub fn match_guided(
     let of_views = |a: Parts, b: Parts| {
         let mut found = Vec::new();
         for (a, b) in a.into_iter().zip(b) {
-            match_parts_guided(params, (first, a), (second, b), second_from_first, &mut found);
+            let needed = needed.map(|[of_first, of_second]| [&of_first[a.clone()], &of_second[b.clone()]]);
+            match_parts(params, [(first, a), (second, b)], second_from_first, needed, &mut found);
         }
         found
     };
@@ -73,40 +105,127 @@ pub fn match_guided(
 
 type Part<'a> = ((&'a ImageFeatures, &'a Rays), Range<usize>);
 
-fn match_parts_guided(
+fn match_parts(
     params: &GuidedParams,
-    (first, a): Part<'_>,
-    (second, b): Part<'_>,
+    parts: [Part<'_>; 2],
     second_from_first: &Matrix3<f64>,
+    needed: Option<[&[bool]; 2]>,
     found: &mut Vec<Match>,
 ) {
-    let (queries, others) = (&first.1.bearings[a.clone()], &second.1.bearings[b.clone()]);
-    let Some(sectors) = Sectors::new(others, second_from_first, params.max_angle_rad) else { return };
-    let max_sine = params.max_angle_rad.sin();
-    let mut forward = vec![TwoNearest::NONE; queries.len()];
-    let mut backward = vec![TwoNearest::NONE; others.len()];
-    for (index, bearing) in queries.iter().enumerate() {
-        let Some(plane) = (second_from_first * bearing).try_normalize(f64::EPSILON) else { continue };
-        let descriptor = first.0.descriptor(a.start + index);
-        for &candidate in sectors.candidates(&plane) {
-            let bearing = &others[candidate as usize];
-            // Keypoints without a ray have the zero vector, which lies in every plane.
-            if bearing.dot(&plane).abs() > max_sine || *bearing == Vector3::zeros() {
-                continue;
-            }
-            let distance2 = squared_distance(descriptor, second.0.descriptor(b.start + candidate as usize));
-            forward[index].offer(candidate, distance2);
-            backward[candidate as usize].offer(index as u32, distance2);
-        }
-    }
+    let mut search = Search::new(parts, second_from_first, params.max_angle_rad);
     let max_distance = params.max_distance * f64::from(DESCRIPTOR_NORM);
     let accepts = |nearest: &TwoNearest| passes(nearest, params.ratio, max_distance);
-    let matches = collect(&forward, accepts, |first, second| {
-        let back = &backward[second as usize];
-        back.index == first && accepts(back)
+    match needed {
+        None => search.compare(|_| true, |_| true, Offer::Both),
+        Some([of_first, of_second]) => {
+            let (is_first, is_second) = (|at: u32| of_first[at as usize], |at: u32| of_second[at as usize]);
+            search.compare(is_first, |_| true, Offer::Both);
+            search.compare(|at| !is_first(at), is_second, Offer::Both);
+            // What needed ones are nearest to must find them nearest among all.
+            let nearest_to = |of: &[TwoNearest], is_asked: &[bool], others: &[bool]| {
+                let mut asked = vec![false; others.len()];
+                for (nearest, _) in
+                    of.iter().zip(is_asked).filter(|(nearest, asked)| **asked && accepts(nearest))
+                {
+                    asked[nearest.index as usize] = !others[nearest.index as usize];
+                }
+                asked
+            };
+            let of_needed_first = nearest_to(&search.forward, of_first, of_second);
+            let of_needed_second = nearest_to(&search.backward, of_second, of_first);
+            search.compare(|at| of_needed_second[at as usize], |at| !is_second(at), Offer::ToFirst);
+            search.compare(|at| !is_first(at), |at| of_needed_first[at as usize], Offer::ToSecond);
+        }
+    }
+    let is_asked = |m: &Match| {
+        needed.is_none_or(|[of_first, of_second]| of_first[m.first as usize] || of_second[m.second as usize])
+    };
+    let matches = collect(&search.forward, accepts, |first, second| {
+        let back = &search.backward[second as usize];
+        back.index == first && accepts(back) && is_asked(&Match { first, second })
     });
-    let (first, second) = (a.start as u32, b.start as u32);
+    let [first, second] = [0, 1].map(|side: usize| search.parts[side].1.start as u32);
     found.extend(matches.iter().map(|m| Match { first: m.first + first, second: m.second + second }));
+}
+
+/// Whose nearest a comparison may change.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Offer {
+    Both,
+    ToFirst,
+    ToSecond,
+}
+
+/// What has been found nearest to each keypoint of two images within the bands of the other's epipolar circles.
+struct Search<'a> {
+    parts: [Part<'a>; 2],
+    second_from_first: Matrix3<f64>,
+    max_angle_rad: f64,
+    forward: Vec<TwoNearest>,
+    backward: Vec<TwoNearest>,
+}
+
+impl<'a> Search<'a> {
+    fn new(parts: [Part<'a>; 2], second_from_first: &Matrix3<f64>, max_angle_rad: f64) -> Self {
+        let [forward, backward] = [&parts[0].1, &parts[1].1].map(|part| vec![TwoNearest::NONE; part.len()]);
+        Self { parts, second_from_first: *second_from_first, max_angle_rad, forward, backward }
+    }
+
+    /// Compares these keypoints of the first image with those of the second that lie in their bands.
+    fn compare(&mut self, of_first: impl Fn(u32) -> bool, of_second: impl Fn(u32) -> bool, offer: Offer) {
+        let [(first, a), (second, b)] = &self.parts;
+        let (queries, others) = (&first.1.bearings[a.clone()], &second.1.bearings[b.clone()]);
+        let asked: Vec<u32> = (0..others.len() as u32).filter(|&at| of_second(at)).collect();
+        let bearings: Vec<Vector3<f64>> = asked.iter().map(|&at| others[at as usize]).collect();
+        let Some(sectors) = Sectors::new(&bearings, &self.second_from_first, self.max_angle_rad) else {
+            return;
+        };
+        let (level, max_sine) = (Level::detect(), self.max_angle_rad.sin());
+        let base = &second.0.descriptors[b.start * DESCRIPTOR_LEN..b.end * DESCRIPTOR_LEN];
+        let (mut candidates, mut distances) = (Vec::new(), Vec::new());
+        for (at, bearing) in (0u32..).zip(queries).filter(|(at, _)| of_first(*at)) {
+            let Some(plane) = (self.second_from_first * bearing).try_normalize(f64::EPSILON) else {
+                continue;
+            };
+            // Keypoints without a ray have the zero vector, which lies in every plane.
+            let is_in_band = |candidate: &&u32| {
+                let bearing = &bearings[**candidate as usize];
+                bearing.dot(&plane).abs() <= max_sine && *bearing != Vector3::zeros()
+            };
+            candidates.clear();
+            candidates
+                .extend(sectors.candidates(&plane).iter().filter(is_in_band).map(|&at| asked[at as usize]));
+            squared_distances(
+                level,
+                first.0.descriptor(a.start + at as usize),
+                base,
+                &candidates,
+                &mut distances,
+            );
+            for (&candidate, &distance2) in candidates.iter().zip(&distances) {
+                if offer != Offer::ToSecond {
+                    self.forward[at as usize].offer(candidate, distance2);
+                }
+                if offer != Offer::ToFirst {
+                    self.backward[candidate as usize].offer(at, distance2);
+                }
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// Squared distances of a descriptor from some of an image's.
+    fn squared_distances(query: &[u8], base: &[u8], candidates: &[u32], distances: &mut Vec<u32>) {
+        distances.clear();
+        let Some(query) = query.first_chunk::<DESCRIPTOR_LEN>() else { return };
+        let (base, _) = base.as_chunks::<DESCRIPTOR_LEN>();
+        distances.extend(candidates.iter().map(|&candidate| {
+            let difference = |(&a, &b): (&u8, &u8)| i32::from(i16::from(a) - i16::from(b));
+            let squares = query.iter().zip(&base[candidate as usize]).map(difference).map(|value| value * value);
+            squares.sum::<i32>() as u32
+        }));
+    }
 }
 
 /// The second image's keypoints by azimuth about its epipole: every epipolar plane contains the epipole, so the
@@ -249,6 +368,42 @@ mod tests {
                     }
                 }
             }
+        }
+    }
+
+    #[test]
+    fn those_of_needed_keypoints_are_the_same_as_among_all() {
+        let pair = pair();
+        let mut rng = ChaCha8Rng::seed_from_u64(8);
+        let (first, second) = ((&pair.first.0, &pair.first.1), (&pair.second.0, &pair.second.1));
+        for share in [0.0, 0.05, 0.3, 1.0] {
+            let needed = [(); 2].map(|()| (0..400).map(|_| rng.random_bool(share)).collect::<Vec<bool>>());
+            let is_needed = |m: &Match| needed[0][m.first as usize] || needed[1][m.second as usize];
+            for max_angle_rad in [0.002, 0.02, 0.2] {
+                let params = GuidedParams { max_angle_rad, ratio: 0.95, ..GuidedParams::default() };
+                let mut all = match_guided(&params, first, second, &pair.essential);
+                all.retain(is_needed);
+                let asked = [&needed[0][..], &needed[1][..]];
+                let among = match_guided_among(&params, first, second, &pair.essential, asked);
+                assert_eq!(among, all, "{share} {max_angle_rad}");
+                assert!(share < 0.3 || max_angle_rad > 0.1 || all.len() > 50, "{}", all.len());
+            }
+        }
+    }
+
+    #[test]
+    fn distances_are_the_same_by_all_instructions() {
+        let pair = pair();
+        let descriptors = &pair.first.0.descriptors;
+        let candidates: Vec<u32> = (0..400).step_by(3).collect();
+        let query = &descriptors[DESCRIPTOR_LEN..2 * DESCRIPTOR_LEN];
+        let of = |at: &u32| &descriptors[*at as usize * DESCRIPTOR_LEN..][..DESCRIPTOR_LEN];
+        let expected: Vec<u32> =
+            candidates.iter().map(|at| super::super::squared_distance(query, of(at))).collect();
+        for level in [Level::Baseline, Level::detect()] {
+            let mut distances = Vec::new();
+            squared_distances(level, query, descriptors, &candidates, &mut distances);
+            assert_eq!(distances, expected, "{level:?}");
         }
     }
 

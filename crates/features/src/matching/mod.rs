@@ -16,7 +16,7 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 
 use crate::{Camera, DESCRIPTOR_LEN, DESCRIPTOR_NORM, FeatureError, ImageFeatures, Keypoint};
-pub use guided::{GuidedParams, match_guided};
+pub use guided::{GuidedParams, match_guided, match_guided_among};
 pub use kernel::{DescriptorBlock, TwoNearest, squared_distance, two_nearest};
 
 /// A putative or verified match: keypoint `first` of one image shows what keypoint `second` of another shows.

@@ -1,7 +1,7 @@
 //! Separable Gaussian blurring.
 
 use super::plane::{BLOCK, Plane};
-use super::vectorized::{Level, vectorized};
+use crate::vectorized::{Level, vectorized};
 
 /// Rows that are blurred together; even.
 pub(super) const GROUP: usize = 16;

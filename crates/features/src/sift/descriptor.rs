@@ -2,8 +2,8 @@ use std::ops::RangeInclusive;
 
 use super::orientation::gradients_of_block;
 use super::plane::{LANES, Plane};
-use super::vectorized::{Level, vectorized};
 use crate::DESCRIPTOR_LEN;
+use crate::vectorized::{Level, vectorized};
 
 /// Spatial cells along each side.
 const CELLS: usize = 4;

@@ -1,8 +1,8 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::plane::Plane;
-use super::vectorized::{Level, vectorized};
 use super::{GREY_RANGE, SiftParams};
+use crate::vectorized::{Level, vectorized};
 
 /// Pixels along the border without keypoints.
 const BORDER: usize = 5;

@@ -13,16 +13,15 @@ mod extrema;
 mod octave;
 mod orientation;
 mod plane;
-mod vectorized;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use crate::vectorized::Level;
 use descriptor::{DescriptorRows, Frame, describe, prefetch};
 use extrema::{Extremum, Scan};
 use octave::{Octave, Sigmas, Source};
 use orientation::{OrientationRows, orientations};
 use plane::Plane;
-use vectorized::Level;
 
 use crate::DESCRIPTOR_LEN;
 

@@ -2,7 +2,7 @@ use super::Grey;
 use super::blur::{Blur, GROUP};
 use super::extrema::REACH;
 use super::plane::Plane;
-use super::vectorized::Level;
+use crate::vectorized::Level;
 
 /// What an octave is made of.
 #[derive(Debug, Clone, Copy)]

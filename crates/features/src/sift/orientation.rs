@@ -1,6 +1,6 @@
 use super::Extremum;
 use super::plane::{LANES, Plane};
-use super::vectorized::{Level, vectorized};
+use crate::vectorized::{Level, vectorized};
 
 /// Directions of the histogram.
 const BINS: usize = 36;

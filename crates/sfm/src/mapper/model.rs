@@ -179,6 +179,11 @@ impl<'a> Model<'a> {
         (id != NO_POINT).then_some(PointId(id))
     }
 
+    /// Which keypoints of an image carry a point.
+    pub fn carriers(&self, image: ImageId) -> Vec<bool> {
+        self.point_of_feature[image.index()].iter().map(|id| *id != NO_POINT).collect()
+    }
+
     pub fn point(&self, id: PointId) -> Option<&ModelPoint> {
         self.points[id.index()].as_ref()
     }

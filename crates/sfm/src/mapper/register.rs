@@ -1,5 +1,5 @@
 use nalgebra::Vector3;
-use setloc_features::{GuidedParams, match_guided};
+use setloc_features::{GuidedParams, match_guided_among};
 
 use super::{correspondence::CorrespondenceGraph, direction, model::Model};
 use crate::{
@@ -264,11 +264,13 @@ pub(super) fn hypothesize_baseline(
     let world_from_image = pose.world_from_camera * image_from_other.inverse();
     let step = world_from_image.translation - pose.center();
     let features = |image: ImageId| (model.input.images[image.index()].features, &model.rays[image.index()]);
-    let guided = match_guided(
+    let (of_other, of_image) = (model.carriers(other), vec![false; features(image).0.len()]);
+    let guided = match_guided_among(
         &GuidedParams::default(),
         features(other),
         features(image),
         &essential_from_pose(image_from_other),
+        [&of_other, &of_image],
     );
     let rays = &model.rays[image.index()];
     let mut candidates: Vec<(u32, PointId, Vector3<f64>)> = Vec::new();

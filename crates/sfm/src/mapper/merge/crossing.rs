@@ -1,7 +1,7 @@
 use std::collections::BTreeSet;
 
 use rayon::prelude::*;
-use setloc_features::{GuidedParams, Match, match_guided};
+use setloc_features::{GuidedParams, Match, match_guided_among};
 
 use crate::{
     ImageId, Observation, PointId, Similarity, mapper::model::Model, solvers::essential::essential_from_pose,
@@ -93,11 +93,13 @@ impl<'a> Sides<'_, 'a> {
                 let kept_from_image = kept_from_moved.transform_pose(&of_moved.world_from_camera);
                 let moved_from_kept = kept_from_image.inverse() * of_kept.world_from_camera;
                 let features = |model: &Model<'a>, image: ImageId| model.input.images[image.index()].features;
-                let matches = match_guided(
+                let needed = [self.kept.carriers(kept), self.moved.carriers(moved)];
+                let matches = match_guided_among(
                     params,
                     (features(self.kept, kept), &self.kept.rays[kept.index()]),
                     (features(self.moved, moved), &self.moved.rays[moved.index()]),
                     &essential_from_pose(&moved_from_kept),
+                    [&needed[0], &needed[1]],
                 );
                 self.collect(kept, moved, &matches, false, &mut found);
                 found

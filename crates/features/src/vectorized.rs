@@ -2,7 +2,7 @@
 
 /// Which instructions loops may use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Level {
+pub(crate) enum Level {
     Baseline,
     #[cfg(target_arch = "x86_64")]
     Avx2,
@@ -35,7 +35,7 @@ impl Level {
 macro_rules! vectorized {
     ($(#[$doc:meta])* fn $name:ident($($argument:ident: $type:ty),* $(,)?) $(-> $result:ty)? $body:block) => {
         $(#[$doc])*
-        pub(super) fn $name(level: $crate::sift::vectorized::Level, $($argument: $type),*) $(-> $result)? {
+        pub(super) fn $name(level: $crate::vectorized::Level, $($argument: $type),*) $(-> $result)? {
             #[inline(always)]
             fn body($($argument: $type),*) $(-> $result)? $body
             #[cfg(target_arch = "x86_64")]
@@ -49,15 +49,15 @@ macro_rules! vectorized {
                 body($($argument),*)
             }
             match level {
-                $crate::sift::vectorized::Level::Baseline => body($($argument),*),
+                $crate::vectorized::Level::Baseline => body($($argument),*),
                 // SAFETY: a level is only made by detecting its instructions.
                 #[cfg(target_arch = "x86_64")]
-                $crate::sift::vectorized::Level::Avx2 => unsafe { avx2($($argument),*) },
+                $crate::vectorized::Level::Avx2 => unsafe { avx2($($argument),*) },
                 // SAFETY: as above.
                 #[cfg(target_arch = "x86_64")]
-                $crate::sift::vectorized::Level::Avx512 => unsafe { avx512($($argument),*) },
+                $crate::vectorized::Level::Avx512 => unsafe { avx512($($argument),*) },
             }
         }
     };
 }
-pub(super) use vectorized;
+pub(crate) use vectorized;
