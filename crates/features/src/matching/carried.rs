@@ -27,7 +27,7 @@ const HEADINGS: usize = 720;
 struct Place {
     /// The higher of the two elevations.
     highest: f32,
-    /// The lower of the two, less the higher.
+    /// By how much they differ.
     risen: f32,
     /// How far the second is turned from the first, from 0 to a full turn.
     turned: f32,

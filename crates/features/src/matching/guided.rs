@@ -56,7 +56,7 @@ pub fn match_guided(
 
 /// Those matches of [`match_guided`] of which one keypoint at least is needed: far faster where few are.
 ///
-/// `needed` says of each keypoint of the first and of the second image whether it is.
+/// `needed` says of every keypoint of the first and of the second image whether it is.
 pub fn match_guided_among(
     params: &GuidedParams,
     first: (&ImageFeatures, &Rays),
@@ -73,7 +73,7 @@ pub fn match_guided_among(
     matches
 }
 
-/// All matches, or of those of which no keypoint is needed any.
+/// All matches; where only some keypoints are needed, those of these and any of the others.
 fn match_where(
     params: &GuidedParams,
     first: (&ImageFeatures, &Rays),
@@ -137,12 +137,9 @@ fn match_parts(
             search.compare(|at| !is_first(at), |at| of_needed_first[at as usize], Offer::ToSecond);
         }
     }
-    let is_asked = |m: &Match| {
-        needed.is_none_or(|[of_first, of_second]| of_first[m.first as usize] || of_second[m.second as usize])
-    };
     let matches = collect(&search.forward, accepts, |first, second| {
         let back = &search.backward[second as usize];
-        back.index == first && accepts(back) && is_asked(&Match { first, second })
+        back.index == first && accepts(back)
     });
     let [first, second] = [0, 1].map(|side: usize| search.parts[side].1.start as u32);
     found.extend(matches.iter().map(|m| Match { first: m.first + first, second: m.second + second }));
