@@ -43,8 +43,12 @@ impl Place {
 
     /// Whether nothing but this heading is between the two.
     fn keeps(&self, heading: f32) -> bool {
-        let off = (self.turned - heading + PI).rem_euclid(TAU) - PI;
-        self.risen <= SAME && off.abs() * self.highest.cos() <= SAME
+        self.risen <= SAME && self.turned_beyond(heading).abs() * self.highest.cos() <= SAME
+    }
+
+    /// How much farther the second is turned than by a heading, from minus to plus half a turn.
+    fn turned_beyond(&self, heading: f32) -> f32 {
+        (self.turned - heading + PI).rem_euclid(TAU) - PI
     }
 }
 
@@ -60,26 +64,24 @@ pub(super) fn without_carried(
         Place::of(keypoints, elevations)
     };
     let places: Vec<Place> = matches.iter().map(place).collect();
-    let is_low = |place: &&Place| place.highest < BELOW;
-    let Some(heading) = common_heading(places.iter().filter(is_low)) else { return matches };
-    let keeps = |place: &&Place| place.keeps(heading);
-    if places.iter().filter(is_low).filter(keeps).count() < FEWEST {
+    let is_low = |place: &Place| place.highest < BELOW;
+    let (low, others): (Vec<&Place>, Vec<&Place>) = places.iter().partition(|place| is_low(place));
+    let Some(heading) = common_heading(&low) else { return matches };
+    let kept_of = |some: &[&Place]| some.iter().filter(|place| place.keeps(heading)).count();
+    let is_one_place = || !others.is_empty() && kept_of(&others) as f64 >= ONE_PLACE * others.len() as f64;
+    if kept_of(&low) < FEWEST || is_one_place() {
         return matches;
     }
-    let others = || places.iter().filter(|place| !is_low(place));
-    if others().count() > 0 && others().filter(keeps).count() as f64 >= ONE_PLACE * others().count() as f64 {
-        return matches;
-    }
-    let is_carried = |place: &Place| is_low(&place) && keeps(&place);
+    let is_carried = |place: &Place| is_low(place) && place.keeps(heading);
     matches.into_iter().zip(&places).filter(|(_, place)| !is_carried(place)).map(|(m, _)| m).collect()
 }
 
 /// The heading between two panoramas that most of these matches have in common.
-fn common_heading<'p>(places: impl Iterator<Item = &'p Place> + Clone) -> Option<f32> {
+fn common_heading(places: &[&Place]) -> Option<f32> {
     let mut counts = [0_u32; HEADINGS];
     let bin = |place: &Place| (place.turned / TAU * HEADINGS as f32) as usize % HEADINGS;
-    let level = places.filter(|place| place.risen <= SAME);
-    for place in level.clone() {
+    let level = || places.iter().filter(|place| place.risen <= SAME);
+    for place in level() {
         counts[bin(place)] += 1;
     }
     let around = |at: usize| [at + HEADINGS - 1, at, at + 1].map(|at| at % HEADINGS);
@@ -90,8 +92,8 @@ fn common_heading<'p>(places: impl Iterator<Item = &'p Place> + Clone) -> Option
         return None;
     }
     let middle = (best as f32 + 0.5) / HEADINGS as f32 * TAU;
-    let near = level.filter(|place| around(best).contains(&bin(place)));
-    let off: f32 = near.map(|place| (place.turned - middle + PI).rem_euclid(TAU) - PI).sum();
+    let near = level().filter(|place| around(best).contains(&bin(place)));
+    let off: f32 = near.map(|place| place.turned_beyond(middle)).sum();
     Some((middle + off / count as f32).rem_euclid(TAU))
 }
 

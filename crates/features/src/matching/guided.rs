@@ -4,7 +4,7 @@ use std::ops::Range;
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::kernel::TwoNearest;
+use super::kernel::{TwoNearest, squared_distance};
 use super::{Match, Parts, collect, match_simulated, passes};
 use crate::vectorized::{Level, vectorized};
 use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Rays};
@@ -173,6 +173,9 @@ impl<'a> Search<'a> {
         let [(first, a), (second, b)] = &self.parts;
         let (queries, others) = (&first.1.bearings[a.clone()], &second.1.bearings[b.clone()]);
         let asked: Vec<u32> = (0..others.len() as u32).filter(|&at| of_second(at)).collect();
+        if asked.is_empty() {
+            return;
+        }
         let bearings: Vec<Vector3<f64>> = asked.iter().map(|&at| others[at as usize]).collect();
         let Some(sectors) = Sectors::new(&bearings, &self.second_from_first, self.max_angle_rad) else {
             return;
@@ -215,13 +218,10 @@ vectorized! {
     /// Squared distances of a descriptor from some of an image's.
     fn squared_distances(query: &[u8], base: &[u8], candidates: &[u32], distances: &mut Vec<u32>) {
         distances.clear();
+        // With lengths that are known the loop has no rest.
         let Some(query) = query.first_chunk::<DESCRIPTOR_LEN>() else { return };
         let (base, _) = base.as_chunks::<DESCRIPTOR_LEN>();
-        distances.extend(candidates.iter().map(|&candidate| {
-            let difference = |(&a, &b): (&u8, &u8)| i32::from(i16::from(a) - i16::from(b));
-            let squares = query.iter().zip(&base[candidate as usize]).map(difference).map(|value| value * value);
-            squares.sum::<i32>() as u32
-        }));
+        distances.extend(candidates.iter().map(|&candidate| squared_distance(query, &base[candidate as usize])));
     }
 }
 
@@ -395,8 +395,7 @@ mod tests {
         let candidates: Vec<u32> = (0..400).step_by(3).collect();
         let query = &descriptors[DESCRIPTOR_LEN..2 * DESCRIPTOR_LEN];
         let of = |at: &u32| &descriptors[*at as usize * DESCRIPTOR_LEN..][..DESCRIPTOR_LEN];
-        let expected: Vec<u32> =
-            candidates.iter().map(|at| super::super::squared_distance(query, of(at))).collect();
+        let expected: Vec<u32> = candidates.iter().map(|at| squared_distance(query, of(at))).collect();
         for level in [Level::Baseline, Level::detect()] {
             let mut distances = Vec::new();
             squared_distances(level, query, descriptors, &candidates, &mut distances);
