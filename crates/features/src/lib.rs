@@ -58,7 +58,8 @@ mod sift;
 mod vectorized;
 
 pub use camera::{
-    Calibration, Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole, ProjectJacobian, UnprojectJacobian,
+    Calibration, Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole, PlainRay, ProjectJacobian,
+    UnprojectJacobian,
 };
 pub use decode::{
     CameraSource, DecodeLimits, DecodedImage, GPano, GeoPosition, ImageInfo, ImageMetadata, decode,

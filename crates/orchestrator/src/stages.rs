@@ -31,8 +31,8 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// their ends. 8: holds features of its images. 9: half as many.
 /// 10: says which images it has grown by. 11: an index for each component, features of all their images, and which of
 /// them are placed. 12: about which images it may be folded. 13: which
-/// errors its images share. 14: and how these change the stretch of panoramas. 15: adjusted in fewer steps.
-pub const SCENE_VERSION: u32 = 15;
+/// errors its images share. 14: and how these change the stretch of panoramas. 15: adjusted in fewer steps. 16: to first order.
+pub const SCENE_VERSION: u32 = 16;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
 /// Version of set localization.

@@ -30,6 +30,7 @@ mod normal_equations;
 mod pattern;
 mod problem;
 mod residual;
+mod response;
 mod spherical;
 
 use nalgebra::Matrix6;
@@ -47,6 +48,7 @@ pub use problem::{
     BundleBearing, BundleObservation, BundlePoint, BundlePose, BundleProblem, CameraPrior, IntrinsicsFreedom,
     ParameterEstimate, PositionPrior,
 };
+pub use response::step;
 
 /// S counts as singular when it has an eigenvalue below this, relative to the diagonal of JᵀJ.
 const SINGULAR_SHARE: f64 = 1e-13;
@@ -155,15 +157,25 @@ pub fn solve(params: &BundleParams, problem: &mut BundleProblem) -> BundleReport
         minimize(&mut model, &mut equations, &Limits::from(params))
     };
     if outcome.accepted > 0 {
-        model.store(problem);
-        for (&index, position) in point_of_index.iter().zip(equations.points()) {
-            let point = &mut problem.points[index as usize];
-            if !point.fixed {
-                point.position = *position;
-            }
-        }
+        store(&model, &equations, &point_of_index, problem);
     }
     BundleReport::new(&outcome, observations, ignored, degrees_of_freedom)
+}
+
+/// Writes the current state of everything that is free.
+fn store(
+    model: &Spherical,
+    equations: &NormalEquations<POSE_DIM>,
+    point_of_index: &[u32],
+    problem: &mut BundleProblem,
+) {
+    model.store(problem);
+    for (&index, position) in point_of_index.iter().zip(equations.points()) {
+        let point = &mut problem.points[index as usize];
+        if !point.fixed {
+            point.position = *position;
+        }
+    }
 }
 
 /// Marginal covariances of poses, 6×6 each, in the order asked for.

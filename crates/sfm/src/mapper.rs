@@ -84,7 +84,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 45;
+pub const MAPPER_VERSION: u32 = 46;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -4,7 +4,7 @@
 //! and what is left of their distortions moves whole regions of the picture. Points of one region are then off together, and
 //! the poses with them, so that no number of points averages it out, while each by itself fits its views within the noise of
 //! keypoints. How large these errors are, residuals of neighbouring points show: where noise is independent, their products are
-//! zero in the mean. What they do, draws of such errors show, for each of which the model is adjusted again.
+//! zero in the mean. What they do, draws of such errors show, which move the model's places and, to first order, the model with them.
 
 use nalgebra::{Matrix3, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
@@ -15,8 +15,7 @@ use setloc_features::Camera;
 
 use crate::alignment::{adjustable_poses, shares_standpoints};
 use crate::bundle::{
-    self, BundleObservation, BundleParams, BundlePoint, BundleProblem, CameraPrior, IntrinsicsFreedom,
-    RobustLoss,
+    self, BundleObservation, BundlePoint, BundleProblem, CameraPrior, IntrinsicsFreedom, RobustLoss,
 };
 use crate::synthetic::normal;
 use crate::{ImageId, Place, Reconstruction, ReconstructionPoint, Rigid, Similarity, nearest_rotation};
@@ -37,9 +36,8 @@ const MIN_SHARE: f64 = 0.05;
 
 /// Draws of the errors.
 const DRAWS: u32 = 16;
-/// Relative decrease of the cost that ends the adjustment of a draw. What is left then is 4 % of what the draw moves, where sixteen
-/// draws tell a deviation to 18 %, and spares a third of the steps.
-const DRAW_TOLERANCE: f64 = 1e-4;
+/// Loss of the places that a model was adjusted to.
+const LOSS: RobustLoss = RobustLoss::Cauchy(1.0);
 /// Waves that a field is the sum of.
 const WAVES: usize = 24;
 /// Angle in radians over which errors go together, as the deviation of a Gaussian: 7°, as in residuals of real panoramas (products
@@ -72,9 +70,11 @@ impl SharedErrors {
             return None;
         }
         let sigma_rad = shared.sqrt();
-        let mut problem = problem_of(model);
-        let params = BundleParams { loss: RobustLoss::Cauchy(1.0), ..BundleParams::default() };
-        bundle::solve(&params, &mut problem);
+        let problem = problem_of(model).reweighted(LOSS);
+        let mut unmoved = problem.clone();
+        if !bundle::step(&mut unmoved) {
+            return None;
+        }
         let of_draw = |draw: u32| {
             let mut moved = problem.clone();
             let fields: Vec<BearingField> =
@@ -84,12 +84,12 @@ impl SharedErrors {
                 let field = &fields[seen.pose as usize];
                 seen.pixel = field.moved(camera, &seen.pixel).unwrap_or(seen.pixel);
             }
-            bundle::solve(&BundleParams { function_tolerance: DRAW_TOLERANCE, ..params }, &mut moved);
-            let pairs = problem.poses.iter().zip(&moved.poses);
+            bundle::step(&mut moved);
+            let pairs = unmoved.poses.iter().zip(&moved.poses);
             let pairs: Vec<(Rigid, Rigid)> =
                 pairs.map(|(to, from)| (to.world_from_camera, from.world_from_camera)).collect();
             let frame = common_frame(&pairs);
-            let cameras = model.cameras.iter().zip(problem.cameras.iter().zip(&moved.cameras));
+            let cameras = model.cameras.iter().zip(unmoved.cameras.iter().zip(&moved.cameras));
             let cameras: Vec<Camera> = cameras.map(|(own, change)| changed_alike(own, change)).collect();
             let mut poses = vec![None; model.images.len()];
             for (&image, (before, after)) in images.iter().zip(&pairs) {
@@ -408,7 +408,7 @@ mod tests {
             }
         }
         let mut problem = problem_of(&model);
-        bundle::solve(&BundleParams::default(), &mut problem);
+        bundle::solve(&bundle::BundleParams::default(), &mut problem);
         for (image, pose) in model.images.iter_mut().zip(&problem.poses) {
             image.world_from_camera = Some(pose.world_from_camera);
         }

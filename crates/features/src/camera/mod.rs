@@ -94,6 +94,14 @@ impl UnprojectJacobian {
     }
 }
 
+/// A unit ray of a panorama before it is stretched, and how it moves with the pixel.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlainRay {
+    bearing: Vector3<f64>,
+    /// 3 × 2.
+    d_pixel: Matrix3x2<f64>,
+}
+
 impl Camera {
     /// A full panorama of `width` × `height` pixels.
     pub fn equirectangular(width: u32, height: u32) -> Self {
@@ -278,6 +286,18 @@ impl Camera {
         let d_params = self.model.fold_columns(&canonical);
         let d_pixel = Matrix3x2::from_columns(&[d_x, d_y]);
         Some(UnprojectJacobian { bearing: undistorted.bearing, d_pixel, d_params })
+    }
+
+    /// What [`Camera::unproject_plain`] needs of a pixel of a stretched panorama, whatever the stretch; `None` for all other
+    /// cameras, and where there is no ray.
+    pub fn plain_ray(&self, pixel: &Vector2<f64>) -> Option<PlainRay> {
+        self.is_stretched().then(|| stitched::plain_ray(&self.params, pixel)).flatten()
+    }
+
+    /// [`Camera::unproject_with_jacobian`] of a stretched panorama, its sphere being known, without what takes time.
+    pub fn unproject_plain(&self, plain: &PlainRay) -> UnprojectJacobian {
+        debug_assert!(self.is_stretched());
+        stitched::of_plain(&self.params, plain)
     }
 
     /// [`Camera::unproject`] and [`Camera::pixel_angle`] of a pixel in one, which spares inverting the distortion twice.

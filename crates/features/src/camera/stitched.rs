@@ -13,9 +13,9 @@
 //! the sides less, as with two fisheyes whose radial calibration is a little off. The fifth such term stretches the
 //! vertical; upright panoramas do not tell it, as a scene stretched like them would look the same.
 
-use nalgebra::{Matrix3, Matrix3x2, Vector2, Vector3};
+use nalgebra::{Matrix3, Matrix3x2, SMatrix, Vector2, Vector3};
 
-use super::{ProjectJacobian, UnprojectJacobian, equirectangular};
+use super::{MAX_CAMERA_PARAMS, PlainRay, ProjectJacobian, UnprojectJacobian, equirectangular};
 
 /// Parameters of the sphere and its crop.
 const OF_SPHERE: usize = 4;
@@ -60,21 +60,37 @@ pub(super) fn project_with_jacobian(params: &[f64], direction: &Vector3<f64>) ->
 }
 
 pub(super) fn unproject_with_jacobian(params: &[f64], pixel: &Vector2<f64>) -> Option<UnprojectJacobian> {
-    let mut ray = equirectangular::unproject_with_jacobian(&params[..OF_SPHERE], pixel)?;
-    let (plain, stretch) = (ray.bearing, stretch(params));
-    let stretched = stretch * plain;
-    let length = stretched.norm();
-    ray.bearing = stretched / length;
-    let tangent = (Matrix3::identity() - ray.bearing * ray.bearing.transpose()) / length;
-    let by_plain = tangent * stretch;
-    ray.d_pixel =
-        Matrix3x2::from_columns(&[by_plain * ray.d_pixel.column(0), by_plain * ray.d_pixel.column(1)]);
+    let plain = equirectangular::unproject_with_jacobian(&params[..OF_SPHERE], pixel)?;
+    let mut ray = of_plain(params, &PlainRay { bearing: plain.bearing, d_pixel: plain.d_pixel });
+    let by_plain = by_plain(params, &plain.bearing).1;
     for at in 0..OF_SPHERE {
-        let moved = by_plain * ray.d_params.column(at);
-        ray.d_params.set_column(at, &moved);
-    }
-    for (at, term) in TERMS.iter().enumerate() {
-        ray.d_params.set_column(OF_SPHERE + at, &(tangent * (term * plain)));
+        ray.d_params.set_column(at, &(by_plain * plain.d_params.column(at)));
     }
     Some(ray)
+}
+
+pub(super) fn plain_ray(params: &[f64], pixel: &Vector2<f64>) -> Option<PlainRay> {
+    let ray = equirectangular::unproject_with_jacobian(&params[..OF_SPHERE], pixel)?;
+    Some(PlainRay { bearing: ray.bearing, d_pixel: ray.d_pixel })
+}
+
+/// Where this panorama shows what a plain one shows along a ray; nothing by the parameters of the sphere.
+pub(super) fn of_plain(params: &[f64], plain: &PlainRay) -> UnprojectJacobian {
+    let (bearing, by_plain, tangent) = by_plain(params, &plain.bearing);
+    let d_pixel = [0, 1].map(|at| by_plain * plain.d_pixel.column(at));
+    let mut d_params = SMatrix::<f64, 3, MAX_CAMERA_PARAMS>::zeros();
+    for (at, term) in TERMS.iter().enumerate() {
+        d_params.set_column(OF_SPHERE + at, &(tangent * (term * plain.bearing)));
+    }
+    UnprojectJacobian { bearing, d_pixel: Matrix3x2::from_columns(&d_pixel), d_params }
+}
+
+/// The unit ray for a plain one, its derivative by that, and its derivative by itself before it had unit length.
+fn by_plain(params: &[f64], plain: &Vector3<f64>) -> (Vector3<f64>, Matrix3<f64>, Matrix3<f64>) {
+    let stretch = stretch(params);
+    let stretched = stretch * plain;
+    let length = stretched.norm();
+    let bearing = stretched / length;
+    let tangent = (Matrix3::identity() - bearing * bearing.transpose()) / length;
+    (bearing, tangent * stretch, tangent)
 }

@@ -358,3 +358,16 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn a_plain_ray_that_is_stretched_is_the_ray() {
+    let mut camera = Camera::equirectangular(3072, 1536).as_stitched().unwrap();
+    let pixel = Vector2::new(2200.5, 400.25);
+    assert_eq!(Camera::equirectangular(3072, 1536).plain_ray(&pixel), None);
+    assert_eq!(camera.plain_ray(&Vector2::new(10.0, -5.0)), None);
+    let plain = camera.plain_ray(&pixel).unwrap();
+    camera.params[4..].copy_from_slice(&[0.05, -0.03, 0.02, 0.04]);
+    let (ray, whole) = (camera.unproject_plain(&plain), camera.unproject_with_jacobian(&pixel).unwrap());
+    assert_eq!((ray.bearing, ray.d_pixel), (whole.bearing, whole.d_pixel));
+    assert_eq!(ray.d_params.columns(4, 4), whole.d_params.columns(4, 4));
+}

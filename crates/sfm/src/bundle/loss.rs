@@ -43,6 +43,22 @@ impl RobustLoss {
         }
     }
 
+    /// ρ′(s) + s ρ″(s): half the trace of the second derivative of ½ρ(‖r‖²) by r, the mean of what it is along r and across it.
+    pub(super) fn mean_curvature(self, s: f64) -> f64 {
+        match self {
+            Self::Trivial => 1.0,
+            Self::Huber(k) => {
+                if s <= k * k {
+                    1.0
+                } else {
+                    0.5 * k / s.sqrt()
+                }
+            }
+            Self::Cauchy(k) => (1.0 + s / (k * k)).powi(-2),
+            Self::SoftL1(k) => (1.0 + 0.5 * s / (k * k)) * (1.0 + s / (k * k)).powf(-1.5),
+        }
+    }
+
     /// Whether the scale is usable.
     pub fn is_valid(self) -> bool {
         match self {
@@ -107,6 +123,21 @@ impl LossSum {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn mean_curvature_is_half_the_trace_of_the_second_derivative() {
+        let losses =
+            [RobustLoss::Trivial, RobustLoss::Huber(1.5), RobustLoss::Cauchy(1.5), RobustLoss::SoftL1(1.5)];
+        for loss in losses {
+            for s in [0.0, 0.3, 1.0, 4.0, 50.0] {
+                let slope = |s: f64| loss.evaluate(s).1;
+                let second =
+                    (slope(s + 1e-5) - slope((s - 1e-5).max(0.0))) / if s > 0.0 { 2e-5 } else { 1e-5 };
+                let expected = slope(s) + s * second;
+                assert!((loss.mean_curvature(s) - expected).abs() < 1e-6, "{loss:?} {s}");
+            }
+        }
+    }
 
     #[test]
     fn a_sum_is_that_of_its_terms() {

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector2, Vector3};
 use rayon::prelude::*;
-use setloc_features::{Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole};
+use setloc_features::{Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole, PlainRay, UnprojectJacobian};
 
 use super::normal_equations::{BlockTerm, ExtraTerm, Linearized, Link, Model, Structure};
 use super::pattern::NONE;
@@ -60,6 +60,24 @@ struct PixelRay {
     camera: u32,
     pixel: Vector2<f64>,
     noise_px: f64,
+    /// What does not change of the ray of a stretched panorama.
+    plain: Option<PlainRay>,
+}
+
+impl PixelRay {
+    fn unproject(&self, camera: &Camera) -> Option<UnprojectJacobian> {
+        match &self.plain {
+            Some(plain) => Some(camera.unproject_plain(plain)),
+            None => camera.unproject_with_jacobian(&self.pixel),
+        }
+    }
+
+    /// As [`bearing_and_weight`].
+    fn bearing_and_weight(&self, camera: &Camera) -> Option<(Vector3<f64>, f64)> {
+        let Some(plain) = &self.plain else { return bearing_and_weight(camera, &self.pixel, self.noise_px) };
+        let ray = camera.unproject_plain(plain);
+        Some((ray.bearing, 1.0 / (ray.pixel_angle() * self.noise_px)))
+    }
 }
 
 /// A usable prior on a free pose.
@@ -343,7 +361,9 @@ impl Spherical {
         let pixel_ray = |&index: &u32| {
             let &BundleObservation { pose, pixel, noise_px, .. } =
                 problem.observations.get(index as usize)?;
-            Some(PixelRay { camera: problem.poses[pose as usize].camera, pixel, noise_px })
+            let camera = problem.poses[pose as usize].camera;
+            let plain = problem.cameras[camera as usize].plain_ray(&pixel);
+            Some(PixelRay { camera, pixel, noise_px, plain })
         };
         let in_order = || order.par_iter().with_min_len(4 * OBSERVATIONS_PER_TASK);
         let (mut links, mut rays) = (Vec::new(), Vec::new());
@@ -411,13 +431,13 @@ impl Model<POSE_DIM> for Spherical {
         let (mut bearing, mut weight) = (ray.bearing, ray.inverse_sigma);
         let mut jacobian = None;
         if link.extra != NONE
-            && let Some(PixelRay { camera, pixel, noise_px }) = &self.pixel_rays[observation]
-            && let Some(of_camera) = self.cameras[*camera as usize].unproject_with_jacobian(pixel)
+            && let Some(seen) = &self.pixel_rays[observation]
+            && let Some(of_camera) = seen.unproject(&self.cameras[seen.camera as usize])
         {
             bearing = of_camera.bearing;
             let pixel_angle = of_camera.pixel_angle();
-            weight = 1.0 / (pixel_angle * noise_px);
-            jacobian = Some((of_camera, pixel_angle));
+            weight = 1.0 / (pixel_angle * seen.noise_px);
+            jacobian = Some((of_camera, pixel_angle, seen.plain.is_some()));
         }
         let x = pose.camera_point(point);
         let angular = angular(&bearing, &x);
@@ -433,12 +453,14 @@ impl Model<POSE_DIM> for Spherical {
                     [by_rotation.x, by_rotation.y, by_rotation.z, -by_point.x, -by_point.y, -by_point.z];
             }
         }
-        if let Some((jacobian, pixel_angle)) = jacobian {
+        if let Some((jacobian, pixel_angle, is_panorama)) = jacobian {
             let FreeIntrinsics { parameters, moved, .. } = &self.intrinsics[link.extra as usize];
             for (k, (&parameter, moved)) in parameters.iter().zip(moved).enumerate() {
                 let db = jacobian.d_params.column(parameter).into_owned();
                 let change = bearing_change(&bearing, &angular.direction, &db);
-                let log_sigma = moved.d_log_pixel_angle(&bearing, &db, pixel_angle);
+                // A stretch of a percent changes what a pixel spans by a percent, and where it looks by many pixels.
+                let log_sigma =
+                    if is_panorama { 0.0 } else { moved.d_log_pixel_angle(&bearing, &db, pixel_angle) };
                 for row in 0..2 {
                     out.extra[row][k] =
                         weight * angular.wrt_direction[row].dot(&change) - out.residual[row] * log_sigma;
@@ -451,9 +473,8 @@ impl Model<POSE_DIM> for Spherical {
     fn squared_residual(&self, observation: usize, point: &Vector3<f64>) -> f64 {
         let ray = &self.rays[observation];
         let (mut bearing, mut weight) = (ray.bearing, ray.inverse_sigma);
-        if let Some(Some(PixelRay { camera, pixel, noise_px })) = self.pixel_rays.get(observation) {
-            let camera = &self.candidate_cameras[*camera as usize];
-            match bearing_and_weight(camera, pixel, *noise_px) {
+        if let Some(Some(seen)) = self.pixel_rays.get(observation) {
+            match seen.bearing_and_weight(&self.candidate_cameras[seen.camera as usize]) {
                 Some(of_camera) => (bearing, weight) = of_camera,
                 // The candidate intrinsics lost a pixel: no valid state.
                 None => return f64::INFINITY,
@@ -550,7 +571,11 @@ impl Model<POSE_DIM> for Spherical {
 }
 
 /// Bearing and 1/σ of a pixel, or `None` when they are no finite positive numbers.
-fn bearing_and_weight(camera: &Camera, pixel: &Vector2<f64>, noise_px: f64) -> Option<(Vector3<f64>, f64)> {
+pub(super) fn bearing_and_weight(
+    camera: &Camera,
+    pixel: &Vector2<f64>,
+    noise_px: f64,
+) -> Option<(Vector3<f64>, f64)> {
     if !(pixel.x.is_finite() && pixel.y.is_finite() && noise_px.is_finite() && noise_px > 0.0) {
         return None;
     }

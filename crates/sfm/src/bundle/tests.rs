@@ -607,3 +607,61 @@ fn point_seen_once_changes_no_covariance() {
         assert!((before - after).norm() < 1e-6 * before.norm());
     }
 }
+
+#[test]
+fn a_step_is_what_an_adjustment_does_about_a_small_change() {
+    for loss in
+        [RobustLoss::Trivial, RobustLoss::Huber(1.0), RobustLoss::Cauchy(1.0), RobustLoss::SoftL1(1.0)]
+    {
+        let mut problem = scene(6, 400, 0.5, 21);
+        solve(&BundleParams { loss, ..tight() }, &mut problem);
+        let weighted = problem.reweighted(loss);
+        let respond = |by: f64, seed: u64| {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let (mut adjusted, mut stepped) = (problem.clone(), weighted.clone());
+            let shift = Vector2::new(normal(&mut rng), normal(&mut rng)) * by;
+            // Half of one image, as an error that its directions share.
+            for (a, b) in adjusted.observations.iter_mut().zip(&mut stepped.observations) {
+                if a.pose == 2 && a.pixel.x < 2048.0 {
+                    (a.pixel, b.pixel) = (a.pixel + shift, b.pixel + shift);
+                }
+            }
+            solve(&BundleParams { loss, ..tight() }, &mut adjusted);
+            let mut unmoved = weighted.clone();
+            assert!(step(&mut unmoved) && step(&mut stepped));
+            let (_, by_adjustment) = largest_error(&adjusted, &problem);
+            let (_, by_step) = largest_error(&stepped, &unmoved);
+            let (_, apart) = largest_error(&stepped, &adjusted);
+            (by_adjustment, by_step, apart)
+        };
+        let (mut adjusted, mut stepped, mut apart) = (0.0, 0.0, 0.0);
+        for seed in 0..8 {
+            let errors = respond(0.3, seed);
+            adjusted += errors.0.powi(2);
+            stepped += errors.1.powi(2);
+            apart += errors.2.powi(2);
+        }
+        // By squares to first order; a loss also lets go of one observation and takes up another.
+        if loss == RobustLoss::Trivial {
+            assert!(apart < 1e-4 * adjusted, "{adjusted} {stepped} {apart}");
+        } else {
+            assert!((0.6..1.6).contains(&(stepped / adjusted)), "{loss:?} {adjusted} {stepped} {apart}");
+        }
+    }
+}
+
+#[test]
+fn a_step_moves_nothing_where_nothing_is_free_or_known() {
+    let mut problem = scene(4, 100, 0.5, 23);
+    for pose in &mut problem.poses {
+        pose.fixed = true;
+    }
+    for point in &mut problem.points {
+        point.fixed = true;
+    }
+    let before = problem.clone();
+    assert!(!step(&mut problem));
+    assert_eq!(problem, before);
+    problem.observations.clear();
+    assert!(!step(&mut problem));
+}

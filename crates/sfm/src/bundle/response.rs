@@ -1,0 +1,61 @@
+//! What an adjusted problem answers, to first order, when what it was adjusted to is changed a little.
+
+use super::camera_system::Budget;
+use super::normal_equations::{Model, NormalEquations};
+use super::residual::angular_squared;
+use super::spherical::{Layout, POSE_DIM, Spherical, bearing_and_weight};
+use super::{BundleProblem, LinearSolver, RobustLoss, store};
+
+/// Damping of the step: enough to keep a free gauge where it is, too little for what bends a long chain to notice.
+const LAMBDA: f64 = 1e-10;
+
+impl BundleProblem {
+    /// The same problem with what the loss makes of each observation and bearing, at the current state, in its noise: ρ′ + sρ″, the
+    /// mean of the loss' curvatures along the residual and across it.
+    pub fn reweighted(&self, loss: RobustLoss) -> Self {
+        let mut weighted = self.clone();
+        let camera_point = |pose: u32, point: u32| {
+            let point = self.points.get(point as usize)?.position;
+            Some(self.poses.get(pose as usize)?.world_from_camera.inverse().transform_point(&point))
+        };
+        for seen in &mut weighted.observations {
+            let whitened = || {
+                let camera = self.cameras.get(self.poses.get(seen.pose as usize)?.camera as usize)?;
+                let (bearing, inverse_sigma) = bearing_and_weight(camera, &seen.pixel, seen.noise_px)?;
+                Some(angular_squared(&bearing, &camera_point(seen.pose, seen.point)?) * inverse_sigma.powi(2))
+            };
+            if let Some(squared) = whitened() {
+                seen.noise_px /= loss.mean_curvature(squared).sqrt();
+            }
+        }
+        for seen in &mut weighted.bearings {
+            if let Some(point) = camera_point(seen.pose, seen.point) {
+                let squared = angular_squared(&seen.bearing, &point) / seen.sigma.powi(2);
+                seen.sigma /= loss.mean_curvature(squared).sqrt();
+            }
+        }
+        weighted
+    }
+}
+
+/// Takes one Gauss–Newton step of the squares, whatever becomes of the cost; false, and nothing is changed, where there is none.
+///
+/// From the minimum of a problem whose observations, bearings or fixed poses have then been moved a little, this is what their
+/// move does to all the rest, to first order, for one factorization in place of the dozens that an adjustment takes along its
+/// weakest directions. Where the problem was not at its minimum, take off what the step does without the move.
+pub fn step(problem: &mut BundleProblem) -> bool {
+    let (mut model, Layout { structure, point_of_index, .. }) = Spherical::new(problem, RobustLoss::Trivial);
+    let budget = Budget::new(LinearSolver::Auto, structure.links.len());
+    let mut equations = NormalEquations::<POSE_DIM>::new(structure, &budget);
+    let cost = equations.linearize(&model, LAMBDA);
+    if equations.unknowns() == 0 || !cost.is_finite() || !equations.factorize(LAMBDA) {
+        return false;
+    }
+    let is_valid = equations.solve(LAMBDA, &mut model).is_some_and(|(_, candidate)| candidate.is_finite());
+    if is_valid {
+        model.accept();
+        equations.accept();
+        store(&model, &equations, &point_of_index, problem);
+    }
+    is_valid
+}
