@@ -29,6 +29,7 @@ mod pictures;
 mod refine;
 mod set;
 mod single;
+mod stretch;
 pub mod synthetic;
 mod types;
 mod underfoot;
@@ -70,7 +71,7 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// directions of the scene's images share. 34: and how these change the stretch of panoramas. 35: focal lengths that a
 /// set's photos contradict; walls by what is more alike. 36: what matches err alike. 37: wrong matches do not stand for the
 /// noise of right ones.
-pub const VERSION: u32 = 37;
+pub const VERSION: u32 = 38;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

@@ -16,6 +16,7 @@ use crate::common::{CommonErrors, PoseError, shift_of_point};
 use crate::common_turn::CommonTurn;
 use crate::evidence::{PhotoRays, ray_error_sigmas};
 use crate::jackknife::honest_covariances;
+use crate::stretch::{Freed, PhotoStretch};
 use crate::{Scene, SceneMatch};
 
 /// Scale of the robust loss in standard deviations: at one deviation an observation has half its weight, at four (an
@@ -34,6 +35,8 @@ pub(crate) struct JointModel {
     pub points: Vec<Vector3<f64>>,
     /// Lengths of baselines that the points do not tell, between slots of photos.
     pub lengths: Vec<([usize; 3], LengthRatio)>,
+    /// What directions of photos of known intrinsics differ by from these.
+    pub stretch: PhotoStretch,
 }
 
 /// A camera of a joint model.
@@ -172,8 +175,9 @@ pub(crate) struct TiedPoint {
 /// Moves photos and local points (the paper's T_OPT), scene points within what the scene knows of them; returns
 /// covariances of the poses if asked.
 ///
-/// Cameras that are not known are estimated, from what holds for usual photos on. Poses of fewer than three observations stay
-/// where they are.
+/// Cameras that are not known are estimated, from what holds for usual photos on; where covariances are asked for, photos of known
+/// ones are stretched if that spares more than noise would ([`crate::stretch`]). Poses of fewer than three observations stay where
+/// they are.
 pub(crate) fn refine_jointly(
     model: &mut JointModel,
     scene: &Scene<'_>,
@@ -260,7 +264,27 @@ pub(crate) fn refine_jointly(
         problem.hold_length(slots.map(|slot| standpoints.lead[slot] as u32), *length);
     }
     let params = BundleParams { loss: RobustLoss::Cauchy(LOSS_SCALE), ..BundleParams::default() };
-    bundle::solve(&params, &mut problem);
+    let may_be_stretched = |slot: &usize| {
+        let known = &model.cameras[model.photos[*slot].camera].known;
+        standpoints.lead[*slot] == *slot && seen[*slot] >= 3 && *known == KnownOfCamera::Intrinsics
+    };
+    let slots = (0..model.photos.len()).filter(may_be_stretched);
+    if model.stretch.is_free {
+        let freed = Freed::new(&mut problem, &standpoints.sphere, slots);
+        bundle::solve(&params, &mut problem);
+        model.stretch.note(&problem, &freed);
+    } else {
+        let as_told = bundle::solve(&params, &mut problem);
+        if with_covariance {
+            let mut stretched = problem.clone();
+            let freed = Freed::new(&mut stretched, &standpoints.sphere, slots);
+            let report = bundle::solve(&params, &mut stretched);
+            if model.stretch.is_worth(&freed, as_told.final_cost, report.final_cost) {
+                problem = stretched;
+                model.stretch.note(&problem, &freed);
+            }
+        }
+    }
     let mut of_leads = vec![None; model.photos.len()];
     if with_covariance {
         leave_out_strays(&mut problem, &mut origins);
@@ -642,6 +666,7 @@ mod tests {
             photos: vec![JointPhoto { camera: 0, world_from_camera: off, standpoint: 0 }],
             points: Vec::new(),
             lengths: Vec::new(),
+            stretch: PhotoStretch::default(),
         };
         let rays = [PhotoRays::new(&view.features, &world.camera)];
         let seen = JointObservations { direct: vec![matches], ..JointObservations::default() };
@@ -650,6 +675,56 @@ mod tests {
         assert!(center < 0.03 && rotation < 0.1, "{center} {rotation}");
         let covariance = covariances[0].expect("fixed points leave nothing undetermined");
         assert!(covariance.trace() > 0.0 && covariance.trace() < 1e-3, "{covariance}");
+    }
+
+    /// A photo of an exact scene whose directions are stretched by these shares of xx and xz: the refined model, errors of centre and
+    /// rotation in degrees, and the centre's standard deviation along its worst axis.
+    fn refined_of_stretched(seed: u64, xx: f64, xz: f64, is_known: bool) -> (JointModel, [f64; 2], f64) {
+        let mut world = World::chain(1, 0.0, seed);
+        world.make_scene_exact();
+        let matches = world.scene_matches(0);
+        let stretch = Matrix3::new(1.0 + xx, 0.0, xz, 0.0, 1.0, 0.0, xz, 0.0, 1.0 - xx);
+        let camera = world.camera.clone();
+        for keypoint in &mut world.photos[0].features.keypoints {
+            let plain = stretch.try_inverse().unwrap() * camera.unproject(&keypoint.pixel()).unwrap();
+            let pixel = camera.project(&plain).unwrap();
+            (keypoint.x, keypoint.y) = (pixel.x as f32, pixel.y as f32);
+        }
+        let view = &world.photos[0];
+        let mut model = JointModel {
+            cameras: vec![JointCamera::new(camera.clone(), is_known)],
+            photos: vec![JointPhoto { camera: 0, world_from_camera: view.pose, standpoint: 0 }],
+            points: Vec::new(),
+            lengths: Vec::new(),
+            stretch: PhotoStretch::default(),
+        };
+        let rays = [PhotoRays::new(&view.features, &camera)];
+        let seen = JointObservations { direct: vec![matches], ..JointObservations::default() };
+        let covariance = refine_jointly(&mut model, &world.scene(), &rays, &seen, true)[0].unwrap();
+        let errors = world.errors(0, &model.photos[0].world_from_camera);
+        (model, errors.into(), crate::verdict::standard_deviations(&covariance).1)
+    }
+
+    #[test]
+    fn a_stretched_photo_is_told_by_its_residuals_and_a_plain_one_keeps_its_intrinsics() {
+        for (xx, xz) in [(0.0, 0.0), (0.006, 0.0), (0.0, -0.006)] {
+            let mut normalized = 0.0;
+            for seed in 40..46 {
+                let (model, [center, rotation], sigma) = refined_of_stretched(seed, xx, xz, true);
+                assert_eq!(model.stretch.is_free, (xx, xz) != (0.0, 0.0), "{seed} {xx} {xz}");
+                let shown = if model.stretch.is_free { 0.0045..0.0075 } else { 0.0..1e-9 };
+                assert!(shown.contains(&model.stretch.largest), "{seed} {xx} {xz} {}", model.stretch.largest);
+                assert!(rotation < 0.1, "{seed} {xx} {xz} {rotation}");
+                normalized += (center / sigma).powi(2) / 6.0;
+            }
+            // By the worst axis at most one, and by three alike three.
+            assert!(normalized < 4.0, "{xx} {xz} {normalized}");
+        }
+    }
+
+    #[test]
+    fn photos_whose_intrinsics_are_estimated_are_not_stretched() {
+        assert!(!refined_of_stretched(34, 0.006, 0.0, false).0.stretch.is_free);
     }
 
     #[test]
@@ -666,6 +741,7 @@ mod tests {
                 photos: cameras.iter().map(photo).collect(),
                 points: Vec::new(),
                 lengths: Vec::new(),
+                stretch: PhotoStretch::default(),
             };
             model.give_own_cameras_where_many();
             (model.photos.iter().map(|photo| photo.camera).collect::<Vec<_>>(), model.cameras)
@@ -703,6 +779,7 @@ mod tests {
                 photos: vec![JointPhoto { camera: 0, world_from_camera: view.pose, standpoint: 0 }],
                 points: Vec::new(),
                 lengths: Vec::new(),
+                stretch: PhotoStretch::default(),
             };
             let rays = [PhotoRays::new(&view.features, &world.camera)];
             let seen = JointObservations { direct: vec![matches], ..JointObservations::default() };

@@ -9,6 +9,7 @@ use setloc_sfm::{ImageId, Rigid};
 use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
 use crate::guided::guided_matches;
 use crate::refine::{JointCamera, JointModel, JointObservations, JointPhoto, refine_jointly};
+use crate::stretch::PhotoStretch;
 use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_precision, judge_support, weaker};
@@ -207,6 +208,7 @@ fn fit(
             photos: vec![JointPhoto { camera: 0, world_from_camera: pose, standpoint: 0 }],
             points: Vec::new(),
             lengths: Vec::new(),
+            stretch: PhotoStretch::of_one(scene),
         };
         refine(&mut model, scene, photo, matches, params.max_error_sigmas, false);
         let rays = PhotoRays::new(photo.features, model.camera_of(0));

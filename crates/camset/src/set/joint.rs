@@ -26,6 +26,7 @@ use crate::refine::{
     refine_jointly,
 };
 use crate::single::{inliers, union};
+use crate::stretch::PhotoStretch;
 use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_precision, judge_support, weaker};
@@ -136,6 +137,20 @@ impl Joint {
     fn seen_from_elsewhere(&self) -> usize {
         self.away_from_main().into_iter().map(|slot| self.direct[slot].len()).sum()
     }
+}
+
+/// Stretches below this are not worth a sentence: half a pixel at the edge of a usual photo.
+const LEAST_SAID: f64 = 5e-4;
+
+/// What the set shows of directions that intrinsics do not tell, in words.
+fn stretch_remark(stretch: &PhotoStretch) -> Option<String> {
+    (stretch.is_free && stretch.largest > LEAST_SAID).then(|| {
+        format!(
+            "directions of its photos differ from what their intrinsics say by up to {:.2} %, as those of photos cut from stitched \
+             panoramas do; this is estimated with the poses",
+            100.0 * stretch.largest
+        )
+    })
 }
 
 /// Takes back a pose that only a scale out of thin air could give.
@@ -259,6 +274,7 @@ impl Component<'_> {
         let names: Vec<&str> = self.members.iter().map(|&photo| self.photos[photo].name).collect();
         let mut remarks = vec![format!("{}: {}", called(&names, self.scene.component), reasons.join("; "))];
         remarks.extend(self.contradicted_cameras());
+        remarks.extend(stretch_remark(&joint.model.stretch));
         remarks.extend(self.lengths().map(|(slots, length)| self.basis(slots, &length)));
         let mut rigid_answers =
             self.rigid_answers(&set_from_camera, &candidates, &rigid, rigid_support, &reasons);
@@ -532,7 +548,7 @@ impl Component<'_> {
         log10_chance_of_more(found, by_chance as f64 + 1.0) <= MAX_LOG10_CHANCE
     }
 
-    /// The paper's T_OPT, in rounds: observations are chosen under the present poses, then all poses move.
+    /// The paper's T_OPT, from the rigid pose on again where the last round shows that photos are stretched.
     fn refine_jointly(
         &self,
         set_from_camera: &[Rigid],
@@ -540,6 +556,21 @@ impl Component<'_> {
         sights: &Sights,
         rigid: &RigidPose,
         walls: &[WallSight],
+    ) -> Joint {
+        let refined =
+            |stretch| self.refine_in_rounds((set_from_camera, candidates), sights, rigid, walls, stretch);
+        let joint = refined(PhotoStretch::of_set(self.scene));
+        if joint.model.stretch.is_free { refined(joint.model.stretch) } else { joint }
+    }
+
+    /// Rounds of the joint refinement: observations are chosen under the present poses, then all poses move.
+    fn refine_in_rounds(
+        &self,
+        (set_from_camera, candidates): (&[Rigid], &[SetCorrespondence]),
+        sights: &Sights,
+        rigid: &RigidPose,
+        walls: &[WallSight],
+        stretch: PhotoStretch,
     ) -> Joint {
         let world_from_set = &rigid.world_from_set;
         let mut model = JointModel {
@@ -560,6 +591,7 @@ impl Component<'_> {
                 .map(|point| world_from_set.transform_point(&point.position))
                 .collect(),
             lengths: self.lengths().map(|(slots, length)| (slots, length.held().1)).collect(),
+            stretch,
         };
         model.give_own_cameras_where_many();
         let mut covariances = Vec::new();
@@ -1001,24 +1033,26 @@ impl Component<'_> {
     }
 
     /// Median distance from a photo to the scene points that it sees, else to those that other photos from its standpoint
-    /// see, else to its local points: where nothing but the standpoint is placed, these have no scale.
+    /// Median distance of what a photo sees: points of the local model and of the scene, of its own or, where it has none, of its
+    /// standpoint.
+    ///
+    /// Of all of these, as one match of the scene at any distance may be chance.
     fn depth(&self, joint: &Joint, slot: usize) -> f64 {
         let photos = &joint.model.photos;
         let center = photos[slot].world_from_camera.translation;
-        let to_scene = |slots: &mut dyn Iterator<Item = usize>| {
-            let seen = slots.flat_map(|slot| &joint.direct[slot]);
-            median(seen.map(|m| (self.scene.index.position(m.point) - center).norm()).collect())
+        let seen_by = |slot: usize| {
+            let sees = move |local: &usize| self.track(*local).iter().any(|&(seer, _)| seer == slot);
+            let local =
+                (0..self.model.points.len()).filter(sees).map(|local| &joint.model.points[local]).copied();
+            let direct = joint.direct[slot].iter().map(|seen| self.scene.index.position(seen.point));
+            local.chain(direct).chain(joint.met[slot].iter().copied())
+        };
+        let median_of = |slots: &mut dyn Iterator<Item = usize>| {
+            median(slots.flat_map(seen_by).map(|point| (point - center).norm()).collect())
         };
         let beside = |other: &usize| photos[*other].standpoint == photos[slot].standpoint;
-        let to_met = || median(joint.met[slot].iter().map(|point| (point - center).norm()).collect());
-        to_scene(&mut std::iter::once(slot))
-            .or_else(to_met)
-            .or_else(|| to_scene(&mut (0..photos.len()).filter(beside)))
-            .or_else(|| {
-                let sees = |local: &usize| self.track(*local).iter().any(|&(seer, _)| seer == slot);
-                let local = (0..self.model.points.len()).filter(sees);
-                median(local.map(|local| (joint.model.points[local] - center).norm()).collect())
-            })
+        median_of(&mut std::iter::once(slot))
+            .or_else(|| median_of(&mut (0..photos.len()).filter(beside)))
             .unwrap_or(0.0)
     }
 }

@@ -1,0 +1,174 @@
+//! Photos whose directions differ from what their intrinsics say.
+//!
+//! A photo that was cut from a stitched panorama has the panorama's stretch (`STITCHED_EQUIRECTANGULAR`), turned to where it looks;
+//! no focal length says it. A stretch I + Q of all directions is, to a pinhole, other focal lengths and another principal point
+//! ([`setloc_features::CameraModel::StitchedEquirectangular`] has the terms), which is also what a calibration of another focus or
+//! temperature is off by. Before a wall such an error looks like a step aside and a turn back: a photo at 7 m from one is 0.06 m off by
+//! 0.3 %, without a residual that stands out. All photos of a set together tell.
+
+use nalgebra::Vector2;
+use setloc_features::Camera;
+use setloc_sfm::bundle::{BundleProblem, CameraPrior, IntrinsicsFreedom};
+
+use crate::Scene;
+
+/// Standard deviation of the terms that turn with the photo's heading. Panoramas of consumer cameras stretch by 0.2–0.6 %.
+const SIGMA: f64 = 0.003;
+/// Share of the cost that stretches must spare to be believed: true intrinsics of 9 rendered sets spare at most 0.8 %, those of
+/// photos cut from panoramas of three real places mostly 4–12 %.
+const LEAST_SPARED: f64 = 0.02;
+/// And how much cost for every parameter, unless they are likely. Half is what noise spares.
+const LEAST_PER_PARAMETER: f64 = 1.0;
+
+/// Whether photos of known intrinsics may be stretched.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct PhotoStretch {
+    /// They may, each standpoint by itself.
+    pub is_free: bool,
+    /// The scene's own panoramas are: those of one place are mostly of one kind.
+    pub is_likely: bool,
+    /// The largest that was found, as a share.
+    pub largest: f64,
+}
+
+impl PhotoStretch {
+    /// Of a photo alone, whose residuals hardly tell: it may where that is likely.
+    pub fn of_one(scene: &Scene<'_>) -> Self {
+        let is_likely = scene.reconstruction.cameras.iter().any(Camera::is_stretched);
+        Self { is_free: is_likely, is_likely, largest: 0.0 }
+    }
+
+    /// Of a set, whose residuals are asked: well calibrated photos are four times as far off where they may be stretched.
+    pub fn of_set(scene: &Scene<'_>) -> Self {
+        Self { is_free: false, ..Self::of_one(scene) }
+    }
+
+    /// Whether these stretches spare more than noise would.
+    pub fn is_worth(&self, freed: &Freed, as_told: f64, stretched: f64) -> bool {
+        let spared = as_told - stretched;
+        let parameters = 4 * freed.cameras.len();
+        let enough = if self.is_likely { 0.0 } else { LEAST_PER_PARAMETER * parameters as f64 };
+        spared > LEAST_SPARED * as_told && spared > enough
+    }
+
+    /// Notes what an adjustment found.
+    pub fn note(&mut self, problem: &BundleProblem, freed: &Freed) {
+        self.is_free = true;
+        self.largest =
+            freed.cameras.iter().map(|&at| problem.cameras[at].largest_stretch()).fold(0.0, f64::max);
+    }
+}
+
+/// Which cameras of a problem are spheres that may be stretched.
+#[derive(Debug, Default)]
+pub(crate) struct Freed {
+    cameras: Vec<usize>,
+}
+
+impl Freed {
+    /// Gives each of these poses a camera of its own that sees all around and may be stretched; what they saw they see there.
+    pub fn new(problem: &mut BundleProblem, sphere: &Camera, poses: impl Iterator<Item = usize>) -> Self {
+        let (mut freed, mut told) = (Self::default(), vec![None; problem.poses.len()]);
+        let Some(stitched) = sphere.as_stitched() else { return freed };
+        problem.camera_freedom.resize(problem.cameras.len(), IntrinsicsFreedom::FIXED);
+        for pose in poses {
+            let at = problem.cameras.len();
+            told[pose] = Some(std::mem::replace(&mut problem.poses[pose].camera, at as u32) as usize);
+            problem.camera_priors.extend(prior(at, &stitched));
+            problem.camera_freedom.push(IntrinsicsFreedom::FREE);
+            problem.cameras.push(stitched.clone());
+            freed.cameras.push(at);
+        }
+        for seen in &mut problem.observations {
+            let Some(camera) = told[seen.pose as usize].map(|camera| &problem.cameras[camera]) else {
+                continue;
+            };
+            if camera == sphere {
+                continue;
+            }
+            let on_sphere = || {
+                let pixel = sphere.project(&camera.unproject(&seen.pixel)?)?;
+                Some((pixel, seen.noise_px * camera.pixel_angle(&seen.pixel)? / sphere.pixel_angle(&pixel)?))
+            };
+            // What has no ray was no use before either.
+            (seen.pixel, seen.noise_px) = on_sphere().unwrap_or((Vector2::repeat(f64::NAN), 1.0));
+        }
+        freed
+    }
+}
+
+/// What is known of a photo's stretch: as of a panorama that looks anywhere, ahead against the sides.
+fn prior(at: usize, stitched: &Camera) -> Option<CameraPrior> {
+    let mut prior = CameraPrior::of_usual_photo(at as u32, stitched)?;
+    for (known, name) in prior.parameters.iter_mut().zip(stitched.model.param_names()) {
+        if matches!(*name, "xx" | "xz") {
+            known.sigma = SIGMA;
+        }
+    }
+    Some(prior)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{UnitQuaternion, Vector3};
+    use setloc_features::CameraModel;
+    use setloc_sfm::Rigid;
+    use setloc_sfm::bundle::{BundleObservation, BundlePose};
+
+    use super::*;
+
+    #[test]
+    fn what_a_photo_saw_its_sphere_sees_in_the_same_direction_as_exactly() {
+        let told = Camera {
+            model: CameraModel::Opencv,
+            width: 1600,
+            height: 1200,
+            params: vec![900.0, 905.0, 810.0, 590.0, -0.1, 0.02, 0.001, 0.0],
+        };
+        let sphere = Camera::equirectangular(4096, 2048);
+        let pose = |camera| BundlePose {
+            camera,
+            world_from_camera: Rigid::new(UnitQuaternion::identity(), Vector3::zeros()),
+            fixed: false,
+        };
+        let seen = |pose, pixel| BundleObservation { pose, point: 0, pixel, noise_px: 0.7 };
+        let pixel = Vector2::new(1500.0, 200.0);
+        let mut problem = BundleProblem {
+            cameras: vec![told.clone(), sphere.clone()],
+            poses: vec![pose(0), pose(0), pose(1)],
+            observations: vec![
+                seen(0, pixel),
+                seen(1, pixel),
+                seen(2, pixel),
+                seen(0, Vector2::repeat(f64::NAN)),
+            ],
+            ..BundleProblem::default()
+        };
+        let before = problem.clone();
+        let freed = Freed::new(&mut problem, &sphere, [0, 2].into_iter());
+        assert_eq!(freed.cameras, [2, 3]);
+        assert_eq!(problem.poses.iter().map(|pose| pose.camera).collect::<Vec<_>>(), [2, 0, 3]);
+        assert_eq!(problem.camera_freedom[..2], [IntrinsicsFreedom::FIXED; 2]);
+        assert_eq!(problem.camera_priors.iter().map(|prior| prior.camera).collect::<Vec<_>>(), [2, 3]);
+        let moved = &problem.observations[0];
+        let (bearing, angle) = problem.cameras[2].ray(&moved.pixel).unwrap();
+        let (expected, pixel_angle) = told.ray(&pixel).unwrap();
+        assert!((bearing - expected).norm() < 1e-12);
+        assert!((angle * moved.noise_px / (pixel_angle * 0.7) - 1.0).abs() < 1e-9);
+        assert_eq!(problem.observations[1..3], before.observations[1..3]);
+        assert!(problem.observations[3].pixel.x.is_nan());
+    }
+
+    #[test]
+    fn noise_is_not_worth_a_stretch_that_nothing_else_speaks_for() {
+        let freed = Freed { cameras: vec![3, 4] };
+        let (unlikely, likely) =
+            (PhotoStretch::default(), PhotoStretch { is_likely: true, ..PhotoStretch::default() });
+        for stretch in [unlikely, likely] {
+            assert!(stretch.is_worth(&freed, 300.0, 290.0));
+            assert!(!stretch.is_worth(&freed, 3000.0, 2945.0), "not two percent");
+        }
+        assert!(!unlikely.is_worth(&freed, 300.0, 293.0), "not a unit for each of eight parameters");
+        assert!(likely.is_worth(&freed, 300.0, 293.0));
+    }
+}
