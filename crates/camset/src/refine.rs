@@ -64,6 +64,10 @@ impl JointCamera {
         Self { camera, known: if is_known { KnownOfCamera::Intrinsics } else { KnownOfCamera::Usual } }
     }
 
+    fn is_known(&self) -> bool {
+        self.known == KnownOfCamera::Intrinsics
+    }
+
     fn freedom(&self) -> IntrinsicsFreedom {
         match self.known {
             KnownOfCamera::Intrinsics => IntrinsicsFreedom::FIXED,
@@ -264,20 +268,21 @@ pub(crate) fn refine_jointly(
         problem.hold_length(slots.map(|slot| standpoints.lead[slot] as u32), *length);
     }
     let params = BundleParams { loss: RobustLoss::Cauchy(LOSS_SCALE), ..BundleParams::default() };
-    let may_be_stretched = |slot: &usize| {
-        let known = &model.cameras[model.photos[*slot].camera].known;
-        standpoints.lead[*slot] == *slot && seen[*slot] >= 3 && *known == KnownOfCamera::Intrinsics
-    };
-    let slots = (0..model.photos.len()).filter(may_be_stretched);
+    // Poses of standpoints all of whose photos are known.
+    let mut slots: Vec<usize> =
+        (0..model.photos.len()).filter(|&slot| standpoints.lead[slot] == slot && seen[slot] >= 3).collect();
+    for photo in model.photos.iter().filter(|photo| !model.cameras[photo.camera].is_known()) {
+        slots.retain(|&slot| slot != photo.standpoint);
+    }
     if model.stretch.is_free {
-        let freed = Freed::new(&mut problem, &standpoints.sphere, slots);
+        let freed = Freed::new(&mut problem, &standpoints.sphere, &slots);
         bundle::solve(&params, &mut problem);
         model.stretch.note(&problem, &freed);
     } else {
         let as_told = bundle::solve(&params, &mut problem);
-        if with_covariance {
+        if with_covariance && !slots.is_empty() {
             let mut stretched = problem.clone();
-            let freed = Freed::new(&mut stretched, &standpoints.sphere, slots);
+            let freed = Freed::new(&mut stretched, &standpoints.sphere, &slots);
             let report = bundle::solve(&params, &mut stretched);
             if model.stretch.is_worth(&freed, as_told.final_cost, report.final_cost) {
                 problem = stretched;

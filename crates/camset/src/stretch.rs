@@ -14,8 +14,8 @@ use crate::Scene;
 
 /// Standard deviation of the terms that turn with the photo's heading. Panoramas of consumer cameras stretch by 0.2–0.6 %.
 const SIGMA: f64 = 0.003;
-/// Share of the cost that stretches must spare to be believed: true intrinsics of 9 rendered sets spare at most 0.8 %, those of
-/// photos cut from panoramas of three real places mostly 4–12 %.
+/// Share of the cost that stretches must spare to be believed: true intrinsics of four rendered sets spare at most 0.8 %, those of
+/// photos cut from panoramas of three real places mostly 4–16 %.
 const LEAST_SPARED: f64 = 0.02;
 /// And how much cost for every parameter, unless they are likely. Half is what noise spares.
 const LEAST_PER_PARAMETER: f64 = 1.0;
@@ -67,11 +67,11 @@ pub(crate) struct Freed {
 
 impl Freed {
     /// Gives each of these poses a camera of its own that sees all around and may be stretched; what they saw they see there.
-    pub fn new(problem: &mut BundleProblem, sphere: &Camera, poses: impl Iterator<Item = usize>) -> Self {
+    pub fn new(problem: &mut BundleProblem, sphere: &Camera, poses: &[usize]) -> Self {
         let (mut freed, mut told) = (Self::default(), vec![None; problem.poses.len()]);
         let Some(stitched) = sphere.as_stitched() else { return freed };
         problem.camera_freedom.resize(problem.cameras.len(), IntrinsicsFreedom::FIXED);
-        for pose in poses {
+        for &pose in poses {
             let at = problem.cameras.len();
             told[pose] = Some(std::mem::replace(&mut problem.poses[pose].camera, at as u32) as usize);
             problem.camera_priors.extend(prior(at, &stitched));
@@ -145,7 +145,7 @@ mod tests {
             ..BundleProblem::default()
         };
         let before = problem.clone();
-        let freed = Freed::new(&mut problem, &sphere, [0, 2].into_iter());
+        let freed = Freed::new(&mut problem, &sphere, &[0, 2]);
         assert_eq!(freed.cameras, [2, 3]);
         assert_eq!(problem.poses.iter().map(|pose| pose.camera).collect::<Vec<_>>(), [2, 0, 3]);
         assert_eq!(problem.camera_freedom[..2], [IntrinsicsFreedom::FIXED; 2]);

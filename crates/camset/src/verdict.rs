@@ -95,10 +95,11 @@ pub(crate) fn judge_precision(
         verdict = Verdict::Uncertain;
     }
     if !(center <= params.max_center_sigma * depth) {
-        let share = 100.0 * center / depth;
-        reasons.push(format!(
-            "the centre is known to {center:.3} units only, {share:.0} % of the viewing distance"
-        ));
+        let share = match 100.0 * center / depth {
+            share if share.is_finite() => format!("{share:.0} % of the viewing distance"),
+            _ => "and how far off what it sees is, nothing tells".to_owned(),
+        };
+        reasons.push(format!("the centre is known to {center:.3} units only, {share}"));
         verdict = Verdict::Uncertain;
     }
     verdict

@@ -84,7 +84,10 @@ impl SharedErrors {
                 let field = &fields[seen.pose as usize];
                 seen.pixel = field.moved(camera, &seen.pixel).unwrap_or(seen.pixel);
             }
-            bundle::step(&mut moved);
+            // What has no answer to one draw has none to the unmoved places either.
+            if !bundle::step(&mut moved) {
+                moved.clone_from(&unmoved);
+            }
             let pairs = unmoved.poses.iter().zip(&moved.poses);
             let pairs: Vec<(Rigid, Rigid)> =
                 pairs.map(|(to, from)| (to.world_from_camera, from.world_from_camera)).collect();

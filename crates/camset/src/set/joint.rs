@@ -1033,26 +1033,40 @@ impl Component<'_> {
     }
 
     /// Median distance from a photo to the scene points that it sees, else to those that other photos from its standpoint
-    /// Median distance of what a photo sees: points of the local model and of the scene, of its own or, where it has none, of its
-    /// standpoint.
+    /// Median distance of what a photo sees: the scene points that it or its standpoint sees, else these and the local points that
+    /// another standpoint sees, too; zero where they are fewer than half of what a verdict asks for.
     ///
-    /// Of all of these, as one match of the scene at any distance may be chance.
+    /// A few of the scene may be chance, at any distance, and what one standpoint sees alone has none. Where nothing but one
+    /// standpoint is placed, local points have no scale: so the scene's come first.
     fn depth(&self, joint: &Joint, slot: usize) -> f64 {
         let photos = &joint.model.photos;
+        let standpoint = |slot: usize| photos[slot].standpoint;
         let center = photos[slot].world_from_camera.translation;
-        let seen_by = |slot: usize| {
-            let sees = move |local: &usize| self.track(*local).iter().any(|&(seer, _)| seer == slot);
-            let local =
-                (0..self.model.points.len()).filter(sees).map(|local| &joint.model.points[local]).copied();
+        let beside: Vec<usize> =
+            (0..photos.len()).filter(|&other| standpoint(other) == standpoint(slot)).collect();
+        let of_scene = |slot: usize| {
             let direct = joint.direct[slot].iter().map(|seen| self.scene.index.position(seen.point));
-            local.chain(direct).chain(joint.met[slot].iter().copied())
+            direct.chain(joint.met[slot].iter().copied())
         };
-        let median_of = |slots: &mut dyn Iterator<Item = usize>| {
-            median(slots.flat_map(seen_by).map(|point| (point - center).norm()).collect())
+        let local = |slot: usize| {
+            let is_seen = move |local: &usize| {
+                let track = self.track(*local);
+                track.iter().any(|&(seer, _)| seer == slot)
+                    && track.iter().any(|&(seer, _)| standpoint(seer) != standpoint(slot))
+            };
+            (0..self.model.points.len()).filter(is_seen).map(|local| joint.model.points[local])
         };
-        let beside = |other: &usize| photos[*other].standpoint == photos[slot].standpoint;
-        median_of(&mut std::iter::once(slot))
-            .or_else(|| median_of(&mut (0..photos.len()).filter(beside)))
+        let median_of = |least: usize, points: &mut dyn Iterator<Item = Vector3<f64>>| {
+            let distances: Vec<f64> = points.map(|point| (point - center).norm()).collect();
+            (distances.len() >= least).then(|| median(distances)).flatten()
+        };
+        let (many, some) = (self.params.verdict.min_inliers, self.params.verdict.min_inliers / 2);
+        median_of(many, &mut of_scene(slot))
+            .or_else(|| median_of(many, &mut beside.iter().copied().flat_map(of_scene)))
+            .or_else(|| median_of(some, &mut of_scene(slot).chain(local(slot))))
+            .or_else(|| {
+                median_of(some, &mut beside.iter().flat_map(|&slot| of_scene(slot).chain(local(slot))))
+            })
             .unwrap_or(0.0)
     }
 }

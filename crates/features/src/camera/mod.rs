@@ -302,10 +302,12 @@ impl Camera {
 
     /// [`Camera::unproject`] and [`Camera::pixel_angle`] of a pixel in one, which spares inverting the distortion twice.
     pub fn ray(&self, pixel: &Vector2<f64>) -> Option<(Vector3<f64>, f64)> {
-        if self.is_panoramic() {
-            return self.unproject(pixel).zip(self.pixel_angle(pixel));
-        }
-        self.unproject_with_jacobian(pixel).map(|ray| (ray.bearing, ray.pixel_angle()))
+        let ray = match self.model {
+            CameraModel::Equirectangular => return self.unproject(pixel).zip(self.pixel_angle(pixel)),
+            CameraModel::StitchedEquirectangular => self.unproject_plain(&self.plain_ray(pixel)?),
+            _ => self.unproject_with_jacobian(pixel)?,
+        };
+        Some((ray.bearing, ray.pixel_angle()))
     }
 
     /// The angle in radians that one pixel spans at this place of the image.

@@ -61,8 +61,7 @@ pub(super) fn project_with_jacobian(params: &[f64], direction: &Vector3<f64>) ->
 
 pub(super) fn unproject_with_jacobian(params: &[f64], pixel: &Vector2<f64>) -> Option<UnprojectJacobian> {
     let plain = equirectangular::unproject_with_jacobian(&params[..OF_SPHERE], pixel)?;
-    let mut ray = of_plain(params, &PlainRay { bearing: plain.bearing, d_pixel: plain.d_pixel });
-    let by_plain = by_plain(params, &plain.bearing).1;
+    let (mut ray, by_plain) = stretched(params, &PlainRay { bearing: plain.bearing, d_pixel: plain.d_pixel });
     for at in 0..OF_SPHERE {
         ray.d_params.set_column(at, &(by_plain * plain.d_params.column(at)));
     }
@@ -74,23 +73,24 @@ pub(super) fn plain_ray(params: &[f64], pixel: &Vector2<f64>) -> Option<PlainRay
     Some(PlainRay { bearing: ray.bearing, d_pixel: ray.d_pixel })
 }
 
-/// Where this panorama shows what a plain one shows along a ray; nothing by the parameters of the sphere.
+/// The ray for a plain one, without its derivatives by the parameters of the sphere.
 pub(super) fn of_plain(params: &[f64], plain: &PlainRay) -> UnprojectJacobian {
-    let (bearing, by_plain, tangent) = by_plain(params, &plain.bearing);
+    stretched(params, plain).0
+}
+
+/// And ∂ray/∂(plain ray).
+fn stretched(params: &[f64], plain: &PlainRay) -> (UnprojectJacobian, Matrix3<f64>) {
+    let stretch = stretch(params);
+    let stretched = stretch * plain.bearing;
+    let length = stretched.norm();
+    let bearing = stretched / length;
+    let tangent = (Matrix3::identity() - bearing * bearing.transpose()) / length;
+    let by_plain = tangent * stretch;
     let d_pixel = [0, 1].map(|at| by_plain * plain.d_pixel.column(at));
     let mut d_params = SMatrix::<f64, 3, MAX_CAMERA_PARAMS>::zeros();
     for (at, term) in TERMS.iter().enumerate() {
         d_params.set_column(OF_SPHERE + at, &(tangent * (term * plain.bearing)));
     }
-    UnprojectJacobian { bearing, d_pixel: Matrix3x2::from_columns(&d_pixel), d_params }
-}
-
-/// The unit ray for a plain one, its derivative by that, and its derivative by itself before it had unit length.
-fn by_plain(params: &[f64], plain: &Vector3<f64>) -> (Vector3<f64>, Matrix3<f64>, Matrix3<f64>) {
-    let stretch = stretch(params);
-    let stretched = stretch * plain;
-    let length = stretched.norm();
-    let bearing = stretched / length;
-    let tangent = (Matrix3::identity() - bearing * bearing.transpose()) / length;
-    (bearing, tangent * stretch, tangent)
+    let ray = UnprojectJacobian { bearing, d_pixel: Matrix3x2::from_columns(&d_pixel), d_params };
+    (ray, by_plain)
 }

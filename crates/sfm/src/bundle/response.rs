@@ -4,10 +4,11 @@ use super::camera_system::Budget;
 use super::normal_equations::{Model, NormalEquations};
 use super::residual::angular_squared;
 use super::spherical::{Layout, POSE_DIM, Spherical, bearing_and_weight};
-use super::{BundleProblem, LinearSolver, RobustLoss, store};
+use super::{BundleProblem, RobustLoss, store};
 
-/// Damping of the step: enough to keep a free gauge where it is, too little for what bends a long chain to notice.
-const LAMBDA: f64 = 1e-10;
+/// Damping of the step, and what is tried where that is too little for the system to be definite in spite of rounding: the first is
+/// enough to keep a free gauge where it is, and too little for what bends a long chain to notice.
+const LAMBDAS: [f64; 3] = [1e-10, 1e-8, 1e-6];
 
 impl BundleProblem {
     /// The same problem with what the loss makes of each observation and bearing, at the current state, in its noise: ρ′ + sρ″, the
@@ -45,13 +46,14 @@ impl BundleProblem {
 /// weakest directions. Where the problem was not at its minimum, take off what the step does without the move.
 pub fn step(problem: &mut BundleProblem) -> bool {
     let (mut model, Layout { structure, point_of_index, .. }) = Spherical::new(problem, RobustLoss::Trivial);
-    let budget = Budget::new(LinearSolver::Auto, structure.links.len());
-    let mut equations = NormalEquations::<POSE_DIM>::new(structure, &budget);
-    let cost = equations.linearize(&model, LAMBDA);
-    if equations.unknowns() == 0 || !cost.is_finite() || !equations.factorize(LAMBDA) {
+    // Conjugate gradients would leave the weakest directions unsolved, which are what a small change moves most.
+    let mut equations = NormalEquations::<POSE_DIM>::new(structure, &Budget::MEMORY);
+    let cost = equations.linearize(&model, LAMBDAS[0]);
+    if equations.unknowns() == 0 || !cost.is_finite() {
         return false;
     }
-    let is_valid = equations.solve(LAMBDA, &mut model).is_some_and(|(_, candidate)| candidate.is_finite());
+    let Some(lambda) = LAMBDAS.into_iter().find(|&lambda| equations.factorize(lambda)) else { return false };
+    let is_valid = equations.solve(lambda, &mut model).is_some_and(|(_, candidate)| candidate.is_finite());
     if is_valid {
         model.accept();
         equations.accept();
