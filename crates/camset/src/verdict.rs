@@ -173,4 +173,21 @@ mod tests {
         assert_eq!(judge(Some(Matrix6::repeat(f64::NAN))), Verdict::Uncertain);
         assert_eq!(judge(None), Verdict::Uncertain);
     }
+
+    #[test]
+    fn a_centre_is_not_known_well_enough_where_nothing_tells_how_far_off_things_are() {
+        let params = VerdictParams::default();
+        let covariance = Matrix6::identity() * 1e-8;
+        let judged = |depth: f64| {
+            let mut reasons = Vec::new();
+            (judge_precision(&params, Some(&covariance), depth, &mut reasons), reasons.join("; "))
+        };
+        assert_eq!(judged(1.0), (Verdict::Localized, String::new()));
+        let (verdict, reasons) = judged(0.004);
+        assert_eq!(verdict, Verdict::Uncertain);
+        assert!(reasons.contains("2 % of the viewing distance"), "{reasons}");
+        let (verdict, reasons) = judged(0.0);
+        assert_eq!(verdict, Verdict::Uncertain);
+        assert!(reasons.contains("nothing tells") && !reasons.contains('%'), "{reasons}");
+    }
 }
