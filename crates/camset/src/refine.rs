@@ -561,15 +561,25 @@ impl Standpoints {
         place: &Place,
         point: u32,
     ) -> Option<BundleObservation> {
-        let Place { mut pixel, mut noise_px } = *place;
-        if self.shared[slot] {
-            let camera = rays[slot].camera;
-            let sigma = noise_px * camera.pixel_angle(&pixel)?;
-            pixel = self.sphere.project(&(self.turn[slot] * camera.unproject(&pixel)?))?;
-            noise_px = sigma / self.sphere.pixel_angle(&pixel)?;
-        }
+        let Place { pixel, noise_px } = if self.shared[slot] {
+            place_on(&self.sphere, rays[slot].camera, &self.turn[slot], place)?
+        } else {
+            *place
+        };
         Some(BundleObservation { pose: self.lead[slot] as u32, point, pixel, noise_px })
     }
+}
+
+/// Where a sphere shows in the same direction, and as exactly, what a camera that is turned against it shows at a place.
+pub(crate) fn place_on(
+    sphere: &Camera,
+    camera: &Camera,
+    turn: &UnitQuaternion<f64>,
+    place: &Place,
+) -> Option<Place> {
+    let sigma = place.noise_px * camera.pixel_angle(&place.pixel)?;
+    let pixel = sphere.project(&(turn * camera.unproject(&place.pixel)?))?;
+    Some(Place { pixel, noise_px: sigma / sphere.pixel_angle(&pixel)? })
 }
 
 /// A camera that sees all around; its pixels only express angles.

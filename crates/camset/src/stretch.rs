@@ -6,12 +6,16 @@
 //! temperature is off by. Before a wall such an error looks like a step aside and a turn back: a photo at 7 m from one is 0.06 m off by
 //! 0.3 %, without a residual that stands out. All photos of a set together tell.
 
-use nalgebra::Vector2;
+use nalgebra::{UnitQuaternion, Vector2};
 use setloc_features::Camera;
+use setloc_sfm::Place;
 use setloc_sfm::bundle::{BundleProblem, CameraPrior, IntrinsicsFreedom};
 
 use crate::Scene;
+use crate::refine::place_on;
 
+/// Terms of a stretch.
+const TERMS: usize = 4;
 /// Standard deviation of the terms that turn with the photo's heading. Panoramas of consumer cameras stretch by 0.2–0.6 %.
 const SIGMA: f64 = 0.003;
 /// Share of the cost that stretches must spare to be believed: true intrinsics of four rendered sets spare at most 0.8 %, those of
@@ -46,7 +50,7 @@ impl PhotoStretch {
     /// Whether these stretches spare more than noise would.
     pub fn is_worth(&self, freed: &Freed, as_told: f64, stretched: f64) -> bool {
         let spared = as_told - stretched;
-        let parameters = 4 * freed.cameras.len();
+        let parameters = TERMS * freed.cameras.len();
         let enough = if self.is_likely { 0.0 } else { LEAST_PER_PARAMETER * parameters as f64 };
         spared > LEAST_SPARED * as_told && spared > enough
     }
@@ -86,12 +90,11 @@ impl Freed {
             if camera == sphere {
                 continue;
             }
-            let on_sphere = || {
-                let pixel = sphere.project(&camera.unproject(&seen.pixel)?)?;
-                Some((pixel, seen.noise_px * camera.pixel_angle(&seen.pixel)? / sphere.pixel_angle(&pixel)?))
-            };
+            let place = Place { pixel: seen.pixel, noise_px: seen.noise_px };
             // What has no ray was no use before either.
-            (seen.pixel, seen.noise_px) = on_sphere().unwrap_or((Vector2::repeat(f64::NAN), 1.0));
+            let nowhere = Place { pixel: Vector2::repeat(f64::NAN), noise_px: 1.0 };
+            let there = place_on(sphere, camera, &UnitQuaternion::identity(), &place).unwrap_or(nowhere);
+            (seen.pixel, seen.noise_px) = (there.pixel, there.noise_px);
         }
         freed
     }
@@ -110,7 +113,7 @@ fn prior(at: usize, stitched: &Camera) -> Option<CameraPrior> {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{UnitQuaternion, Vector3};
+    use nalgebra::Vector3;
     use setloc_features::CameraModel;
     use setloc_sfm::Rigid;
     use setloc_sfm::bundle::{BundleObservation, BundlePose};
