@@ -53,8 +53,8 @@ impl FeatureParams {
     /// 1: OpenCV SIFT, RootSIFT u8, half-pixel corrected, seam padded, spread over the sphere.
     /// 2: own SIFT, bright and dark spots apart. 3: simulated views. 4: large simulated views without their finest points.
     /// 5: weaker keypoints where there are few. 6: keypoints end at most five pixels from where they begin to be sought.
-    /// 7: simulated views where there are few.
-    pub const VERSION: u32 = 7;
+    /// 7: simulated views where there are few. 8: described on layers that are kept in steps of 1/256.
+    pub const VERSION: u32 = 8;
 
     /// Checks the ranges.
     ///

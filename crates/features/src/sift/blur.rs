@@ -33,6 +33,11 @@ impl Blur {
         self.weights.len() - 1
     }
 
+    /// Rows that are blurred already.
+    pub fn done(&self) -> usize {
+        self.done
+    }
+
     /// Blurs the next rows that the source's first `written` ones allow, a [`GROUP`] at most, and says how many are done.
     pub fn advance(&mut self, level: Level, source: &Plane, written: usize, target: &mut Plane) -> usize {
         let ready = if written == source.height { written } else { written.saturating_sub(self.radius()) };

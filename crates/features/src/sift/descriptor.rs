@@ -1,7 +1,7 @@
 use std::ops::RangeInclusive;
 
 use super::orientation::gradients_of_block;
-use super::plane::{LANES, Plane};
+use super::plane::{Kept, LANES, Plane};
 use crate::DESCRIPTOR_LEN;
 use crate::vectorized::{Level, vectorized};
 
@@ -52,7 +52,7 @@ const HALF: f32 = (CELLS + 1) as f32 / 2.0;
 
 impl Frame {
     /// Columns and rows of the pixels that are looked at; `None` where there are none.
-    fn pixels(&self, plane: &Plane) -> Option<[RangeInclusive<usize>; 2]> {
+    fn pixels(&self, plane: &Plane<Kept>) -> Option<[RangeInclusive<usize>; 2]> {
         let (sine, cosine) = self.orientation.sin_cos();
         let reach = CELL_SIGMAS * self.sigma * HALF * (sine.abs() + cosine.abs());
         let within = |at: f32, len: usize| {
@@ -65,7 +65,7 @@ impl Frame {
 }
 
 /// Asks for the pixels that [`describe`] will read, which are seldom in a cache otherwise.
-pub(super) fn prefetch(plane: &Plane, frame: &Frame) {
+pub(super) fn prefetch(plane: &Plane<Kept>, frame: &Frame) {
     if let Some([columns, rows]) = frame.pixels(plane) {
         for y in rows {
             plane.prefetch(y, *columns.start()..*columns.end() + 1);
@@ -78,7 +78,7 @@ pub(super) fn prefetch(plane: &Plane, frame: &Frame) {
 /// D. G. Lowe, IJCV 2004, section 6.
 pub(super) fn describe(
     level: Level,
-    plane: &Plane,
+    plane: &Plane<Kept>,
     frame: &Frame,
     rows: &mut DescriptorRows,
 ) -> [f32; DESCRIPTOR_LEN] {
@@ -95,7 +95,7 @@ pub(super) fn describe(
 vectorized! {
     /// Adds the gradients of all pixels within the cells.
     fn accumulate(
-        plane: &Plane,
+        plane: &Plane<Kept>,
         frame: &Frame,
         rows: &mut DescriptorRows,
         histogram: &mut [[f32; BINS]; PADDED * PADDED],

@@ -13,7 +13,7 @@ const MAX_WAY: usize = 5;
 /// Rows above and below that are read about a row that is scanned.
 pub(super) const REACH: usize = MAX_WAY + 1;
 /// Flags that are looked at together.
-const CHUNK: usize = 32;
+const CHUNK: usize = size_of::<u64>();
 
 /// An extremum of the difference of Gaussians, in pixels of its octave.
 #[derive(Debug, Clone, Copy)]
@@ -32,16 +32,14 @@ pub(super) struct Extremum {
     pub contrast: f32,
 }
 
-/// Where a scan has come to, with rows of the differences and of their extremes over 3 × 3 pixels.
+/// Where a scan has come to, with rows of the differences.
 #[derive(Debug, Default)]
 pub(super) struct Scan {
     /// The row to be scanned next.
     row: usize,
     /// Three successive rows of each difference, row `y` in slot `y % 3`.
     differences: Vec<[Vec<f32>; 3]>,
-    largest: Vec<Vec<f32>>,
-    smallest: Vec<Vec<f32>>,
-    column: Vec<f32>,
+    /// 1 for candidates of the row, in whole chunks.
     flags: Vec<u8>,
 }
 
@@ -54,14 +52,8 @@ impl Scan {
         for row in self.differences.iter_mut().flatten() {
             row.resize(width, 0.0);
         }
-        for target in [&mut self.largest, &mut self.smallest] {
-            target.resize_with(num_differences, Vec::new);
-            for row in target.iter_mut() {
-                row.resize(width, 0.0);
-            }
-        }
-        self.column.resize(width, 0.0);
-        self.flags.resize(width, 0);
+        self.flags.clear();
+        self.flags.resize(width.next_multiple_of(CHUNK), 0);
     }
 
     /// Finds and refines the extrema of one octave in the rows that the first `written` ones of its blurred layers allow.
@@ -89,16 +81,14 @@ impl Scan {
         }
         for y in self.row..ready {
             subtract_row(level, layers, y + 1, self);
-            extremes_of_row(level, self);
             for layer in 1..self.differences.len() - 1 {
-                flag_extrema(level, self, layer, y % 3, threshold);
-                for (chunk, flags) in self.flags.chunks(CHUNK).enumerate() {
-                    if flags.iter().fold(0, |any, flag| any | flag) == 0 {
-                        continue;
-                    }
-                    for (lane, _) in flags.iter().enumerate().filter(|(_, flag)| **flag != 0) {
-                        let x = chunk * CHUNK + lane;
-                        if (BORDER..width - BORDER).contains(&x) {
+                flag_candidates(level, self, layer, y, threshold);
+                for (chunk, flags) in self.flags.as_chunks::<CHUNK>().0.iter().enumerate() {
+                    let mut flagged = u64::from_le_bytes(*flags);
+                    while flagged != 0 {
+                        let x = chunk * CHUNK + (flagged.trailing_zeros() / u8::BITS) as usize;
+                        flagged &= flagged - 1;
+                        if (BORDER..width - BORDER).contains(&x) && self.is_extremum(layer, x, y) {
                             found.extend(refine(params, layers, layer, x, y));
                         }
                     }
@@ -106,6 +96,19 @@ impl Scan {
             }
         }
         self.row = self.row.max(ready);
+    }
+
+    /// Whether no neighbour in place and scale exceeds a pixel.
+    fn is_extremum(&self, layer: usize, x: usize, y: usize) -> bool {
+        let value = self.differences[layer][y % 3][x];
+        let neighbours = self.differences[layer - 1..=layer + 1]
+            .iter()
+            .flat_map(|rows| rows.iter().flat_map(|row| &row[x - 1..=x + 1]));
+        if value > 0.0 {
+            neighbours.into_iter().all(|&neighbour| value >= neighbour)
+        } else {
+            neighbours.into_iter().all(|&neighbour| value <= neighbour)
+        }
     }
 }
 
@@ -122,57 +125,35 @@ vectorized! {
 }
 
 vectorized! {
-    /// The largest and the smallest of 3 × 3 pixels of each difference.
-    fn extremes_of_row(rows: &mut Scan) {
-        let width = rows.flags.len();
-        for (index, [a, b, c]) in rows.differences.iter().enumerate() {
-            let column = &mut rows.column[..width];
-            let (a, b, c) = (&a[..width], &b[..width], &c[..width]);
-            for x in 0..width {
-                column[x] = larger(larger(a[x], b[x]), c[x]);
-            }
-            let target = &mut rows.largest[index][1..width - 1];
-            for (x, target) in target.iter_mut().enumerate() {
-                *target = larger(larger(column[x], column[x + 1]), column[x + 2]);
-            }
-            for x in 0..width {
-                column[x] = smaller(smaller(a[x], b[x]), c[x]);
-            }
-            let target = &mut rows.smallest[index][1..width - 1];
-            for (x, target) in target.iter_mut().enumerate() {
-                *target = smaller(smaller(column[x], column[x + 1]), column[x + 2]);
-            }
-        }
-    }
-}
-
-vectorized! {
-    /// Marks the pixels that no neighbour in place and scale exceeds.
-    fn flag_extrema(rows: &mut Scan, layer: usize, slot: usize, threshold: f32) {
-        let width = rows.flags.len();
-        let values = &rows.differences[layer][slot][..width];
-        let [l0, l1, l2] = [layer - 1, layer, layer + 1].map(|at| &rows.largest[at][..width]);
-        let [s0, s1, s2] = [layer - 1, layer, layer + 1].map(|at| &rows.smallest[at][..width]);
-        let flags = &mut rows.flags[..width];
-        for x in 0..width {
-            let value = values[x];
-            let largest = larger(larger(l0[x], l1[x]), l2[x]);
-            let smallest = smaller(smaller(s0[x], s1[x]), s2[x]);
-            let is_peak = u8::from(value > threshold) & u8::from(value >= largest);
-            let is_pit = u8::from(value < -threshold) & u8::from(value <= smallest);
+    /// Marks the pixels of a row beyond the threshold that neither the next one in the row nor that in the column exceeds.
+    ///
+    /// Of four neighbours in place of all, since these leave one pixel in ten and only pixels beyond the threshold count.
+    fn flag_candidates(rows: &mut Scan, layer: usize, y: usize, threshold: f32) {
+        let [above, row, below] = slots(y).map(|slot| &rows.differences[layer][slot][..]);
+        let inner = row.len() - 2;
+        let (left, here, right) = (&row[..inner], &row[1..][..inner], &row[2..][..inner]);
+        let (above, below) = (&above[1..][..inner], &below[1..][..inner]);
+        let flags = &mut rows.flags[1..][..inner];
+        for x in 0..inner {
+            let value = here[x];
+            let is_peak = u8::from(value > threshold)
+                & u8::from(value >= left[x])
+                & u8::from(value >= right[x])
+                & u8::from(value >= above[x])
+                & u8::from(value >= below[x]);
+            let is_pit = u8::from(value < -threshold)
+                & u8::from(value <= left[x])
+                & u8::from(value <= right[x])
+                & u8::from(value <= above[x])
+                & u8::from(value <= below[x]);
             flags[x] = is_peak | is_pit;
         }
     }
 }
 
-#[inline(always)]
-fn larger(a: f32, b: f32) -> f32 {
-    if a > b { a } else { b }
-}
-
-#[inline(always)]
-fn smaller(a: f32, b: f32) -> f32 {
-    if a < b { a } else { b }
+/// Where [`Scan::differences`] keep the row above, the row and the one below.
+fn slots(y: usize) -> [usize; 3] {
+    [y - 1, y, y + 1].map(|y| y % 3)
 }
 
 /// Fits a quadratic to the 3 × 3 × 3 neighbours and moves to its extremum; `None` for what moves out, lacks contrast

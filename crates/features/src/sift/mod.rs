@@ -21,7 +21,7 @@ use descriptor::{DescriptorRows, Frame, describe, prefetch};
 use extrema::{Extremum, Scan};
 use octave::{Octave, Sigmas, Source};
 use orientation::{OrientationRows, orientations};
-use plane::Plane;
+use plane::{Kept, Plane};
 
 use crate::DESCRIPTOR_LEN;
 
@@ -147,9 +147,9 @@ impl Workspace {
                 sigma: 0.5 * point.size / pixel,
                 orientation: point.orientation,
             };
-            (&self.octaves[point.octave as usize].layers[point.layer as usize], frame)
+            (self.octaves[point.octave as usize].layer(point.layer as usize), frame)
         };
-        let placed: Vec<(&Plane, Frame)> = order.iter().map(placed).collect();
+        let placed: Vec<(&Plane<Kept>, Frame)> = order.iter().map(placed).collect();
         let mut descriptors = vec![[0.0; DESCRIPTOR_LEN]; chosen.len()];
         for (index, (plane, frame)) in placed.iter().enumerate() {
             if let Some((plane, next)) = placed.get(index + 1) {
@@ -185,7 +185,7 @@ impl Workspace {
             let (done, current) = self.octaves.split_at_mut(octave);
             let current = &mut current[0];
             let source = match done.last() {
-                Some(finer) => Source::Finer(&finer.layers[layers]),
+                Some(finer) => Source::Finer(finer.layer(layers)),
                 None if params.doubled => Source::Doubled(image),
                 None => Source::Photo(image),
             };
@@ -205,7 +205,7 @@ impl Workspace {
                 if !allows(x, y) {
                     continue;
                 }
-                let plane = &current.layers[extremum.layer];
+                let plane = current.layer(extremum.layer);
                 orientations(level, plane, extremum, &mut self.orientation_rows, |orientation| {
                     points.push(SiftPoint {
                         x,

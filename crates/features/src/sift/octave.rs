@@ -1,7 +1,7 @@
 use super::Grey;
 use super::blur::{Blur, GROUP};
 use super::extrema::REACH;
-use super::plane::Plane;
+use super::plane::{Kept, Plane, grey};
 use crate::vectorized::Level;
 
 /// What an octave is made of.
@@ -11,7 +11,7 @@ pub(super) enum Source<'a> {
     /// The photo at twice its size, by linear interpolation: pixel `x` comes to lie at 2x + ½.
     Doubled(Grey<'a>),
     /// Every second pixel of a layer of the finer octave, beginning with the first: pixel `x` is the layer's 2x for any size.
-    Finer(&'a Plane),
+    Finer(&'a Plane<Kept>),
 }
 
 impl Source<'_> {
@@ -33,7 +33,7 @@ impl Source<'_> {
             Self::Doubled(image) => put_doubled_row(image, y, between, target),
             Self::Finer(layer) => {
                 for (value, &from) in target.iter_mut().zip(layer.row(2 * y).iter().step_by(2)) {
-                    *value = from;
+                    *value = grey(from);
                 }
             }
         }
@@ -68,12 +68,19 @@ pub(super) struct Sigmas {
 pub(super) struct Octave {
     /// What the first layer of a photo's first octave is blurred from.
     input: Plane,
-    /// Those that points are described on, from 1 on, are whole; the first and the last two keep the rows that are being scanned.
-    pub layers: Vec<Plane>,
+    /// All layers, of which each keeps the rows that are being scanned.
+    layers: Vec<Plane>,
+    /// Those that points are described on, from layer 1 on.
+    kept: Vec<Plane<Kept>>,
     between: Vec<f32>,
 }
 
 impl Octave {
+    /// The layer of this number, of those that points are described on: from 1 on.
+    pub fn layer(&self, number: usize) -> &Plane<Kept> {
+        &self.kept[number - 1]
+    }
+
     /// Blurs all layers, a few rows at a time so that each finds those it is made of in the processor's caches.
     ///
     /// Hands the layers on with the number of rows that all have, time after time. The last `2·REACH` of these are in all layers.
@@ -92,13 +99,13 @@ impl Octave {
         }
         self.layers.resize_with(blurs.len() + 1, Plane::default);
         for (index, layer) in self.layers.iter_mut().enumerate() {
-            if index == 0 || index + 2 > blurs.len() {
-                let blurred = blurs.get(index).map_or(0, |next| 2 * next.radius());
-                let scanned = blurs[index..].iter().map(Blur::radius).sum::<usize>() + 2 * REACH;
-                layer.resize_keeping(width, height, GROUP + blurred.max(scanned) + 1);
-            } else {
-                layer.resize(width, height);
-            }
+            let blurred = blurs.get(index).map_or(0, |next| 2 * next.radius());
+            let scanned = blurs[index..].iter().map(Blur::radius).sum::<usize>() + 2 * REACH;
+            layer.resize_keeping(width, height, GROUP + blurred.max(scanned) + 1);
+        }
+        self.kept.resize_with(blurs.len() - 2, Plane::default);
+        for layer in &mut self.kept {
+            layer.resize(width, height);
         }
         let (mut put, mut written) = (0, 0);
         while written < height {
@@ -114,7 +121,13 @@ impl Octave {
             };
             for (index, blur) in blurs.iter_mut().enumerate() {
                 let (finer, coarser) = self.layers.split_at_mut(index + 1);
+                let before = blur.done();
                 written = blur.advance(level, &finer[index], written, &mut coarser[0]);
+                if let Some(kept) = self.kept.get_mut(index) {
+                    for y in before..written {
+                        kept.keep(level, y, coarser[0].row(y));
+                    }
+                }
             }
             scan(&self.layers, written);
         }
@@ -167,7 +180,10 @@ mod tests {
         });
         assert_eq!(before, height);
         for index in 1..=3 {
-            assert!((0..height).all(|y| octave.layers[index].row(y) == expected[index].row(y)));
+            let near = |(&kept, &value): (&Kept, &f32)| (grey(kept) - value).abs() < 0.002;
+            assert!(
+                (0..height).all(|y| octave.layer(index).row(y).iter().zip(expected[index].row(y)).all(near))
+            );
         }
     }
 }

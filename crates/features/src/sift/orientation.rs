@@ -1,5 +1,5 @@
 use super::Extremum;
-use super::plane::{LANES, Plane};
+use super::plane::{Kept, LANES, Plane, grey};
 use crate::vectorized::{Level, vectorized};
 
 /// Directions of the histogram.
@@ -22,7 +22,7 @@ pub(super) struct OrientationRows {
 /// D. G. Lowe, IJCV 2004, section 5.
 pub(super) fn orientations(
     level: Level,
-    plane: &Plane,
+    plane: &Plane<Kept>,
     extremum: &Extremum,
     rows: &mut OrientationRows,
     mut found: impl FnMut(f32),
@@ -65,7 +65,7 @@ pub(super) fn orientations(
 }
 
 vectorized! {
-    fn gradients(plane: &Plane, y: usize, left: usize, magnitudes: &mut [[f32; LANES]], bins: &mut [[f32; LANES]]) {
+    fn gradients(plane: &Plane<Kept>, y: usize, left: usize, magnitudes: &mut [[f32; LANES]], bins: &mut [[f32; LANES]]) {
         for (block, (magnitudes, bins)) in magnitudes.iter_mut().zip(bins).enumerate() {
             (*magnitudes, *bins) = gradients_of_block(plane, y, left + block * LANES, BINS as f32);
         }
@@ -76,19 +76,20 @@ vectorized! {
 /// `turn`ths of a turn within [0, turn]. Beyond the row's end, any numbers.
 #[inline(always)]
 pub(super) fn gradients_of_block(
-    plane: &Plane,
+    plane: &Plane<Kept>,
     y: usize,
     left: usize,
     turn: f32,
 ) -> ([f32; LANES], [f32; LANES]) {
-    let at = |y: usize, x: usize| -> &[f32; LANES] {
+    let at = |y: usize, x: usize| -> &[Kept; LANES] {
         plane.padded_row(y)[x..x + LANES].try_into().expect("a slice of this length")
     };
     let (before, after) = (at(y, left - 1), at(y, left + 1));
     let (above, below) = (at(y - 1, left), at(y + 1, left));
     let (mut magnitudes, mut directions) = ([0.0; LANES], [0.0; LANES]);
     for lane in 0..LANES {
-        let (dx, dy) = (after[lane] - before[lane], below[lane] - above[lane]);
+        let dx = grey(after[lane]) - grey(before[lane]);
+        let dy = grey(below[lane]) - grey(above[lane]);
         magnitudes[lane] = (dx * dx + dy * dy).sqrt();
         directions[lane] = turns(dx, dy) * turn;
     }
