@@ -1,5 +1,6 @@
 use crate::DecodedImage;
 use crate::extract::luma;
+use crate::vectorized::{Level as Instructions, vectorized};
 
 /// Most halvings; patches of larger keypoints are not aligned any finer for being taken coarser.
 const MAX_LEVELS: usize = 6;
@@ -54,7 +55,7 @@ impl ImagePyramid {
     pub(super) fn sample(&self, level: usize, grid: &Grid, radius: usize, samples: &mut Samples) -> bool {
         let scale = 1.0 / f64::from(1_u32 << level);
         let level = &self.levels[level];
-        let Samples { places: [columns, rows], values } = samples;
+        let Samples { places: [columns, rows], offsets, corners, values } = samples;
         // Places are taken from a pixel so near that single precision tells a hundred-thousandth of a pixel apart, and
         // so far to the upper left that all are positive.
         if !grid.0.iter().all(Quadratic::is_sane) {
@@ -75,27 +76,25 @@ impl ImagePyramid {
         if !inside && !self.wraps_around {
             return false;
         }
-        let places = columns.iter().zip(rows.iter());
-        values.clear();
-        if inside {
-            values.extend(places.map(|(&x, &y)| {
-                let (column, row) = (x as i32, y as i32);
-                let first = (origin[1] + row as isize) * width + origin[0] + column as isize;
-                level.bilinear([first as usize, first as usize + 1], x - column as f32, y - row as f32)
-            }));
-        } else {
-            values.extend(places.map(|(&x, &y)| {
-                let (column, row) = (x as i32, y as i32);
-                let start = (origin[1] + row as isize) * width;
-                let at = |column: isize| (start + column.rem_euclid(width)) as usize;
-                let column_of_level = origin[0] + column as isize;
-                level.bilinear(
-                    [at(column_of_level), at(column_of_level + 1)],
-                    x - column as f32,
-                    y - row as f32,
-                )
+        corners.clear();
+        if !inside {
+            corners.extend(columns.iter().zip(rows.iter()).map(|(&x, &y)| {
+                let start = (origin[1] + y as isize) * width;
+                let at = |column: isize| (start + (origin[0] + column).rem_euclid(width)) as usize;
+                level.corners([at(x as isize), at(x as isize + 1)])
             }));
         }
+        offsets.resize(columns.len(), 0);
+        split(Instructions::detect(), columns, rows, width as i32, offsets);
+        if inside {
+            let first = origin[1] * width + origin[0];
+            corners.extend(offsets.iter().map(|&offset| {
+                let at = (first + offset as isize) as usize;
+                level.corners([at, at + 1])
+            }));
+        }
+        values.resize(corners.len(), 0.0);
+        interpolate(Instructions::detect(), corners, columns, rows, values);
         true
     }
 }
@@ -150,49 +149,88 @@ impl Quadratic {
 /// The samples of a patch, and memory to find them.
 #[derive(Debug, Default)]
 pub(super) struct Samples {
+    /// Columns and rows, then how far each lies from its pixel to the next.
     places: [Vec<f32>; 2],
+    offsets: Vec<i32>,
+    corners: Vec<[u8; 4]>,
     pub values: Vec<f32>,
 }
 
 impl Level {
-    /// The value between the pixels `upper` and those below them, by its shares of the right and lower ones.
+    /// The pixels `upper` and those below them.
     #[inline]
-    fn bilinear(&self, upper: [usize; 2], right: f32, lower: f32) -> f32 {
-        let value = |at: usize| f32::from(self.values[at]);
-        let row = |[a, b]: [usize; 2]| value(a) + right * (value(b) - value(a));
-        let (above, below) = (row(upper), row(upper.map(|at| at + self.width)));
-        above + lower * (below - above)
+    fn corners(&self, [left, right]: [usize; 2]) -> [u8; 4] {
+        let values = &self.values;
+        [values[left], values[right], values[left + self.width], values[right + self.width]]
     }
 
     /// Half the size, each pixel from 4 × 4 by the weights (1, 3, 3, 1)/8: its centre is that of the 2 × 2 it stands for.
     fn halved(&self, wraps_around: bool) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
-        let column = |x: isize| {
-            if wraps_around {
-                x.rem_euclid(self.width as isize) as usize
-            } else {
-                x.clamp(0, self.width as isize - 1) as usize
-            }
-        };
-        let mut values = Vec::with_capacity(width * height);
-        let mut sums = vec![0_u16; self.width];
-        for y in 0..height {
+        let mut values = vec![0; width * height];
+        // With the columns before the first and after the last.
+        let mut sums = vec![0_u16; self.width + 2];
+        for (y, target) in values.chunks_exact_mut(width.max(1)).enumerate() {
             let row = |step: isize| {
                 let y = (2 * y as isize + step).clamp(0, self.height as isize - 1) as usize;
                 &self.values[y * self.width..(y + 1) * self.width]
             };
-            let (a, b, c, d) = (row(-1), row(0), row(1), row(2));
-            for (x, sum) in sums.iter_mut().enumerate() {
-                *sum = u16::from(a[x]) + 3 * (u16::from(b[x]) + u16::from(c[x])) + u16::from(d[x]);
-            }
-            let halve = |outer: u16, inner: u16| ((outer + 3 * inner + 32) >> 6) as u8;
-            values.extend((0..width).map(|x| {
-                let x = 2 * x;
-                let (left, right) = (column(x as isize - 1), column(x as isize + 2));
-                halve(sums[left] + sums[right], sums[x] + sums[x + 1])
-            }));
+            let inner = &mut sums[1..=self.width];
+            add_rows(Instructions::detect(), [row(-1), row(0), row(1), row(2)], inner);
+            let ends = [inner[0], inner[self.width - 1]];
+            let [before, after] = if wraps_around { [ends[1], ends[0]] } else { ends };
+            (sums[0], sums[self.width + 1]) = (before, after);
+            halve_row(Instructions::detect(), &sums, target);
         }
         Self { width, height, values }
+    }
+}
+
+vectorized! {
+    /// Turns places within [0, 2·[`REACH`]) into how far they lie from the pixels to their upper left, and says where in rows of this
+    /// width these are.
+    fn split(columns: &mut [f32], rows: &mut [f32], width: i32, offsets: &mut [i32]) {
+        const MOST: f32 = 2.0 * REACH as f32;
+        for ((x, y), offset) in columns.iter_mut().zip(rows).zip(offsets) {
+            #[allow(clippy::manual_clamp, reason = "not a number must become 0")]
+            let [x_within, y_within] = [*x, *y].map(|place| place.max(0.0).min(MOST));
+            // SAFETY: numbers that an integer holds. (Conversions that bear any number are done one by one.)
+            let (column, row) = unsafe { (x_within.to_int_unchecked::<i32>(), y_within.to_int_unchecked::<i32>()) };
+            *offset = row * width + column;
+            *x -= column as f32;
+            *y -= row as f32;
+        }
+    }
+}
+
+vectorized! {
+    /// Between four pixels, by the shares of the right and the lower ones.
+    fn interpolate(corners: &[[u8; 4]], right: &[f32], lower: &[f32], values: &mut [f32]) {
+        for (((corners, &right), &lower), value) in corners.iter().zip(right).zip(lower).zip(values) {
+            let [a, b, c, d] = corners.map(f32::from);
+            let (above, below) = (a + right * (b - a), c + right * (d - c));
+            *value = above + lower * (below - above);
+        }
+    }
+}
+
+vectorized! {
+    /// Four rows by the weights (1, 3, 3, 1).
+    fn add_rows(rows: [&[u8]; 4], sums: &mut [u16]) {
+        let [a, b, c, d] = rows.map(|row| &row[..sums.len()]);
+        for (x, sum) in sums.iter_mut().enumerate() {
+            *sum = u16::from(a[x]) + 3 * (u16::from(b[x]) + u16::from(c[x])) + u16::from(d[x]);
+        }
+    }
+}
+
+vectorized! {
+    /// Every second column by the weights (1, 3, 3, 1)/64, the first in the middle of the first four sums.
+    fn halve_row(sums: &[u16], target: &mut [u8]) {
+        let (pairs, next) = (sums.as_chunks::<2>().0, sums[2..].as_chunks::<2>().0);
+        for ((target, &[a, b]), &[c, d]) in target.iter_mut().zip(pairs).zip(next) {
+            *target = ((a + d + 3 * (b + c) + 32) >> 6) as u8;
+        }
     }
 }
 
