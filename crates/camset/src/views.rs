@@ -119,7 +119,12 @@ pub fn match_views(
         let camera = scene.reconstruction.camera_of(image);
         let theirs = features.rays_of(camera, matches.iter().map(|m| m.second));
         let seed = seed.wrapping_add((photo as u64) << 32 | u64::from(image.0));
-        Some((photo, image, verify_pair(two_view, &own, &theirs, &matches, seed), matches.len()))
+        Some((
+            photo,
+            image,
+            verify_pair(two_view, Posture::Any, &own, &theirs, &matches, seed),
+            matches.len(),
+        ))
     };
     let found: Vec<_> = pairs.par_iter().with_max_len(1).map(matched).collect();
     let (mut matches, mut geometries, mut putative) = (Vec::new(), Vec::new(), vec![0; photos.len()]);

@@ -16,7 +16,9 @@ use setloc_sfm::robust::{
 };
 use setloc_sfm::solvers::essential::essential_from_pose;
 use setloc_sfm::solvers::triangulation::{WorldRay, triangulate, triangulate_two_views};
-use setloc_sfm::solvers::{PoseWithFocal, dlt, five_point, gp3p, gp4ps, p3p, p4pf, ugp3ps};
+use setloc_sfm::solvers::{
+    PoseWithFocal, dlt, five_point, gp3p, gp4ps, p3p, p4pf, ugp3ps, upright_three_point,
+};
 use setloc_sfm::synthetic::{
     AbsoluteProblem, FocalProblem, GeneralizedProblem, RaySample, RelativeProblem, perturb, random_unit,
     rotation_angle, same_similarity, seeded,
@@ -102,6 +104,17 @@ fn minimal(criterion: &mut Criterion) {
         let found = five_point(first, second);
         let near = |e: &nalgebra::Matrix3<f64>| {
             truth.is_none_or(|truth| (e - truth).norm().min((e + truth).norm()) < TOLERANCE)
+        };
+        (found.len(), truth.is_none() || found.iter().any(near))
+    });
+    let level = |rng: &mut ChaCha8Rng| {
+        let problem = RelativeProblem::upright(rng, 3);
+        (problem.sample::<3>(), problem.second_from_first)
+    };
+    solver(criterion, "upright_three_point", level, |(first, second), truth| {
+        let found = upright_three_point(first, second);
+        let near = |(rotation, translation): &(nalgebra::Matrix3<f64>, Vector3<f64>)| {
+            rigid_found(&[Rigid::from_matrix(rotation, *translation)], truth)
         };
         (found.len(), truth.is_none() || found.iter().any(near))
     });

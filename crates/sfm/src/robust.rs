@@ -21,10 +21,10 @@ pub use generalized_pose::{
 };
 pub use ransac::{InvalidParams, RansacParams};
 pub use ray_homography::{RayHomographyEstimate, estimate_ray_homography};
-pub(crate) use relative_pose::estimate_turned_pose;
 pub use relative_pose::{
     RelativePoseEstimate, RotationEstimate, estimate_relative_pose, estimate_rotation, refine_relative_pose,
 };
+pub(crate) use relative_pose::{estimate_level_pose, estimate_turned_pose};
 pub use residual::AngularResidual;
 
 use nalgebra::Vector3;

@@ -17,6 +17,7 @@ mod ray_homography;
 mod rotation_quadric;
 mod solutions;
 mod ugp3ps;
+mod upright_three_point;
 
 pub mod essential;
 pub mod triangulation;
@@ -31,6 +32,7 @@ pub use polynomial::real_roots;
 pub use ray_homography::ray_homography;
 pub use solutions::Solutions;
 pub use ugp3ps::ugp3ps;
+pub use upright_three_point::upright_three_point;
 
 use nalgebra::Vector3;
 

@@ -74,7 +74,18 @@ pub struct RelativeProblem {
 impl RelativeProblem {
     /// Noise-free pairs of points at 0.5 to 8 baselines around the first camera.
     pub fn exact(rng: &mut impl Rng, count: usize) -> Self {
-        let second_from_first = Rigid::new(random_rotation(rng), random_unit(rng));
+        let rotation = random_rotation(rng);
+        Self::turned(rng, count, rotation)
+    }
+
+    /// The same where both y axes are vertical.
+    pub fn upright(rng: &mut impl Rng, count: usize) -> Self {
+        let angle = rng.random_range(-std::f64::consts::PI..std::f64::consts::PI);
+        Self::turned(rng, count, UnitQuaternion::from_axis_angle(&Vector3::y_axis(), angle))
+    }
+
+    fn turned(rng: &mut impl Rng, count: usize, rotation: UnitQuaternion<f64>) -> Self {
+        let second_from_first = Rigid::new(rotation, random_unit(rng));
         let (mut first, mut second) = (Vec::with_capacity(count), Vec::with_capacity(count));
         for _ in 0..count {
             let bearing = random_unit(rng);

@@ -2,15 +2,17 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
-use setloc_features::{Match, Rays};
+use setloc_features::{Match, Posture, Rays};
 
 use crate::{
     ImageId, Rigid,
-    robust::{RansacParams, estimate_relative_pose, estimate_rotation, estimate_turned_pose},
+    robust::{
+        RansacParams, estimate_level_pose, estimate_relative_pose, estimate_rotation, estimate_turned_pose,
+    },
 };
 
 /// Bumped when equal inputs and parameters give another geometry.
-pub const TWO_VIEW_VERSION: u32 = 3;
+pub const TWO_VIEW_VERSION: u32 = 4;
 
 /// How to verify a pair.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -27,8 +29,12 @@ pub struct TwoViewParams {
     /// Where a rotation explains most of the inliers: the share of the matches it leaves over that a baseline must
     /// explain for the pair not to count as a rotation. Chance alone reaches a tenth.
     pub min_baseline_share: f64,
-    /// Most samples drawn for one geometry; below a third of inliers a pair is worth little to the mapper.
+    /// Most samples of five drawn for one geometry; below a third of inliers a pair is worth little to the mapper.
     pub max_iterations: u32,
+    /// Most samples of three drawn before for one geometry of two panoramas, which stand about upright.
+    pub max_upright_iterations: u32,
+    /// Most samples of five drawn after these, for panoramas that stand tilted.
+    pub max_tilted_iterations: u32,
     /// Most geometries of one pair.
     pub max_geometries: usize,
     /// Inliers of a further geometry, as a share of the first's.
@@ -44,6 +50,8 @@ impl Default for TwoViewParams {
             rotation_share: 0.8,
             min_baseline_share: 0.2,
             max_iterations: 2500,
+            max_upright_iterations: 1000,
+            max_tilted_iterations: 1000,
             max_geometries: 2,
             min_runner_up_share: 0.2,
         }
@@ -118,6 +126,7 @@ impl PairGeometry {
 /// mapper decides. `first` and `second` are the rays of all keypoints of the two images, `matches` index into them.
 pub fn verify_pair(
     params: &TwoViewParams,
+    posture: Posture,
     first: &Rays,
     second: &Rays,
     matches: &[Match],
@@ -126,9 +135,9 @@ pub fn verify_pair(
     let mut remaining = matches.to_vec();
     let mut found: Vec<TwoView> = Vec::new();
     while found.len() < params.max_geometries {
-        let Some(view) =
-            verify_once(params, first, second, &remaining, None, seed.wrapping_add(found.len() as u64))
-        else {
+        let attitude = Attitude::Held(posture);
+        let seed = seed.wrapping_add(found.len() as u64);
+        let Some(view) = verify_once(params, first, second, &remaining, attitude, seed) else {
             break;
         };
         let share = view.inliers.len() as f64 / found.first().map_or(1, |best| best.inliers.len()) as f64;
@@ -149,7 +158,16 @@ pub(crate) fn verify_turned(
     second_from_first: &UnitQuaternion<f64>,
     seed: u64,
 ) -> Option<TwoView> {
-    verify_once(params, first, second, matches, Some(second_from_first), seed)
+    verify_once(params, first, second, matches, Attitude::Turned(second_from_first), seed)
+}
+
+/// What is known of how two views are turned against each other.
+#[derive(Clone, Copy)]
+enum Attitude<'a> {
+    /// How they are held.
+    Held(Posture),
+    /// `second_from_first` to a few degrees.
+    Turned(&'a UnitQuaternion<f64>),
 }
 
 fn verify_once(
@@ -157,7 +175,7 @@ fn verify_once(
     first: &Rays,
     second: &Rays,
     matches: &[Match],
-    known: Option<&UnitQuaternion<f64>>,
+    attitude: Attitude<'_>,
     seed: u64,
 ) -> Option<TwoView> {
     if matches.len() < params.min_inliers {
@@ -176,9 +194,18 @@ fn verify_once(
         ..RansacParams::default()
     };
     let (bearings, sigmas) = ((&first_bearings, &second_bearings), (&first_sigmas, &second_sigmas));
-    let estimate = match known {
-        Some(turn) => estimate_turned_pose(&ransac, bearings.0, bearings.1, sigmas.0, sigmas.1, turn, seed)?,
-        None => estimate_relative_pose(&ransac, bearings.0, bearings.1, sigmas.0, sigmas.1, seed)?,
+    let estimate = match attitude {
+        Attitude::Turned(turn) => {
+            estimate_turned_pose(&ransac, bearings.0, bearings.1, sigmas.0, sigmas.1, turn, seed)?
+        }
+        Attitude::Held(Posture::Level(_)) => {
+            let tilted = RansacParams { max_iterations: params.max_tilted_iterations, ..ransac.clone() };
+            let upright = params.max_upright_iterations;
+            estimate_level_pose(&tilted, upright, bearings.0, bearings.1, sigmas.0, sigmas.1, seed)?
+        }
+        Attitude::Held(Posture::Any) => {
+            estimate_relative_pose(&ransac, bearings.0, bearings.1, sigmas.0, sigmas.1, seed)?
+        }
     };
     if estimate.inliers.len() < params.min_inliers {
         return None;

@@ -3,7 +3,7 @@
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
+use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match, Posture};
 use setloc_sfm::{
     BaselineLength, CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, PairGeometry,
     Rigid, TwoViewParams, reconstruct, synthetic::normal, verify_pair,
@@ -142,7 +142,10 @@ impl Corner {
                     let second = rng.random_range(0..self.point_of[b].len()) as u32;
                     matches.push(Match { first, second });
                 }
-                for two_view in verify_pair(&TwoViewParams::default(), &rays[a], &rays[b], &matches, 7) {
+                let posture = Posture::of([camera_of(a), camera_of(b)]);
+                for two_view in
+                    verify_pair(&TwoViewParams::default(), posture, &rays[a], &rays[b], &matches, 7)
+                {
                     pairs.push(PairGeometry {
                         first: ImageId(a as u32),
                         second: ImageId(b as u32),

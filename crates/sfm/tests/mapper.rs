@@ -5,7 +5,9 @@ use std::collections::HashMap;
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{Calibration, Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
+use setloc_features::{
+    Calibration, Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match, Posture,
+};
 use setloc_sfm::{
     CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, MergeVerdict, PairGeometry,
     PutativePair, Rigid, Similarity, TwoViewParams, reconstruct, verify_pair,
@@ -144,9 +146,15 @@ impl Street {
         for a in 0..self.features.len() {
             for b in a + 1..self.features.len() {
                 let matches = self.matches(a, b, &mut rng);
-                for two_view in
-                    verify_pair(&TwoViewParams::default(), &rays[a], &rays[b], &matches, (a * 100 + b) as u64)
-                {
+                let posture = Posture::of([&cameras[a], &cameras[b]]);
+                for two_view in verify_pair(
+                    &TwoViewParams::default(),
+                    posture,
+                    &rays[a],
+                    &rays[b],
+                    &matches,
+                    (a * 100 + b) as u64,
+                ) {
                     pairs.push(PairGeometry {
                         first: ImageId(a as u32),
                         second: ImageId(b as u32),
@@ -572,8 +580,15 @@ impl Street {
                     }
                 }
                 let (first, second) = (ImageId(a as u32), ImageId(b as u32));
-                let params = TwoViewParams::default();
-                for two_view in verify_pair(&params, &rays[a], &rays[b], &matches, (a * 100 + b) as u64) {
+                let posture = Posture::of([&self.cameras[a], &self.cameras[b]]);
+                for two_view in verify_pair(
+                    &TwoViewParams::default(),
+                    posture,
+                    &rays[a],
+                    &rays[b],
+                    &matches,
+                    (a * 100 + b) as u64,
+                ) {
                     pairs.push(PairGeometry { first, second, two_view });
                 }
                 putative.push(PutativePair { first, second, matches });

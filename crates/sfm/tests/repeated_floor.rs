@@ -5,7 +5,7 @@ use std::ops::Range;
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use setloc_features::{Calibration, Camera, CameraModel, ImageFeatures, Keypoint, Match};
+use setloc_features::{Calibration, Camera, CameraModel, ImageFeatures, Keypoint, Match, Posture};
 use setloc_sfm::{
     CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, PairGeometry, PutativePair,
     Rigid, Similarity, TwoViewParams, reconstruct, verify_pair,
@@ -150,7 +150,8 @@ impl Room {
         for (a, b) in (0..rays.len()).flat_map(|a| (a + 1..rays.len()).map(move |b| (a, b))) {
             let (first, second) = (ImageId(a as u32), ImageId(b as u32));
             let matches = self.matches(a, b, matching, &mut rng);
-            let views = verify_pair(&TwoViewParams::default(), &rays[a], &rays[b], &matches, 7);
+            let posture = Posture::of([&self.camera; 2]);
+            let views = verify_pair(&TwoViewParams::default(), posture, &rays[a], &rays[b], &matches, 7);
             pairs.extend(views.into_iter().map(|two_view| PairGeometry { first, second, two_view }));
             putative.push(PutativePair { first, second, matches });
         }

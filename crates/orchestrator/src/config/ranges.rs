@@ -75,6 +75,8 @@ const RANGES: &[(&str, Range)] = &[
     ("two_view.min_inliers", Range::From(6.0)),
     ("two_view.min_parallax_deg", Range::Within(0.0, 180.0)),
     ("two_view.max_iterations", Range::Within(50.0, 1e9)),
+    ("two_view.max_upright_iterations", Range::Within(50.0, 1e9)),
+    ("two_view.max_tilted_iterations", Range::Within(50.0, 1e9)),
     ("two_view.max_geometries", Range::From(1.0)),
     ("max_error_sigma", Range::Positive),
     ("max_error_sigmas", Range::Positive),

@@ -234,7 +234,7 @@ fn add_pair(
         // Far fewer are matched than found, and a ray takes longer than what verification does with it.
         let first = first.rays_of(&cameras[0], matches.0.iter().map(|m| m.first));
         let second = second.rays_of(&cameras[1], matches.0.iter().map(|m| m.second));
-        Product::new(VerifiedPair(verify_pair(&two_view, &first, &second, &matches.0, seed)))
+        Product::new(VerifiedPair(verify_pair(&two_view, posture, &first, &second, &matches.0, seed)))
     };
     let verified = graph.add(Job {
         kind: "verify",

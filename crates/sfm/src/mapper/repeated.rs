@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use setloc_features::{Match, Rays};
+use setloc_features::{Match, Posture, Rays};
 
 use super::sides::{compare, count_matches, count_shareable, sees_all_around};
 use super::witnesses::{Witnesses, count_on_circles};
@@ -257,8 +257,12 @@ impl<'a> Underfoot<'a> {
                     !self.is_near(poles, first, m.first) && !self.is_near(poles, second, m.second)
                 });
                 let seed = seed.wrapping_add(at as u64);
+                let posture = Posture::of(
+                    [first, second]
+                        .map(|image| &self.input.cameras[self.input.images[image.index()].camera.index()]),
+                );
                 let geometries = both(&self.rays, first, second)
-                    .map(|[a, b]| verify_pair(&self.input.two_view, a, b, &left.matches, seed));
+                    .map(|[a, b]| verify_pair(&self.input.two_view, posture, a, b, &left.matches, seed));
                 let pair = |two_view| PairGeometry { first, second, two_view };
                 (left, geometries.into_iter().flatten().map(pair).collect())
             })

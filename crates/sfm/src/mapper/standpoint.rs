@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::{UnitQuaternion, Vector3};
 use setloc_features::{
-    Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match, Rays, SimulatedView,
+    Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match, Posture, Rays, SimulatedView,
 };
 
 use super::{InputImage, MapperInput, MapperOutput, MapperParams};
@@ -253,7 +253,7 @@ impl<'a> Standpoints<'a> {
             let seed = seed ^ ((a as u64) << 40) ^ ((b as u64) << 16);
             found.sort_unstable();
             found.dedup();
-            let views = verify_pair(&self.original.two_view, &rays[a], &rays[b], &found, seed);
+            let views = verify_pair(&self.original.two_view, Posture::Any, &rays[a], &rays[b], &found, seed);
             for two_view in views {
                 let (first, second) = (ImageId(a as u32), ImageId(b as u32));
                 self.pairs.push(PairGeometry { first, second, two_view });

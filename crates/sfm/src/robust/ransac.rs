@@ -115,6 +115,16 @@ pub(super) fn lo_ransac<C: Consensus>(
     problem: &mut C,
     seed: u64,
 ) -> Option<Consented<C::Model>> {
+    lo_ransac_from(None, params, problem, seed)
+}
+
+/// [`lo_ransac`] that begins with a model, if there is one, in place of the first sample's.
+pub(super) fn lo_ransac_from<C: Consensus>(
+    start: Option<C::Model>,
+    params: &RansacParams,
+    problem: &mut C,
+    seed: u64,
+) -> Option<Consented<C::Model>> {
     let count = problem.len();
     let needed = params.min_inliers.max(problem.sample_size());
     if count < needed {
@@ -127,16 +137,18 @@ pub(super) fn lo_ransac<C: Consensus>(
     for i in (1..count).rev() {
         order.swap(i, rng.random_range(0..=i));
     }
-    let mut models = Vec::new();
+    let mut models = Vec::from_iter(start);
     let mut best: Option<(C::Model, f64)> = None;
     let mut best_minimal = f64::INFINITY;
     let mut limit = params.max_iterations;
     let mut iterations = 0;
     let mut inliers = Vec::with_capacity(count);
     while iterations < limit {
+        if iterations > 0 || models.is_empty() {
+            models.clear();
+            problem.hypothesize(&mut rng, &mut models);
+        }
         iterations += 1;
-        models.clear();
-        problem.hypothesize(&mut rng, &mut models);
         let mut improved: Option<C::Model> = None;
         for model in &models {
             let score = score(problem, model, &order, bound, best_minimal);
