@@ -6,11 +6,11 @@ use nalgebra::{UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use setloc_features::{
-    Calibration, Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match, Posture,
+    Calibration, Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match, Posture, Rays,
 };
 use setloc_sfm::{
     CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, MergeVerdict, PairGeometry,
-    PutativePair, Rigid, Similarity, TwoViewParams, reconstruct, verify_pair,
+    PutativePair, Rigid, Similarity, TwoView, TwoViewParams, reconstruct, verify_pair,
 };
 
 /// A street of points seen by cameras, with matches between all images that see a point.
@@ -22,6 +22,13 @@ struct Street {
     /// `point_of[image][feature]`; points with the same `look` cannot be told apart.
     point_of: Vec<Vec<usize>>,
     look: Vec<usize>,
+}
+
+/// The geometries of two images by these matches.
+fn verified(cameras: &[Camera], rays: &[Rays], [a, b]: [usize; 2], matches: &[Match]) -> Vec<TwoView> {
+    let posture = Posture::of([&cameras[a], &cameras[b]]);
+    let seed = (a * 100 + b) as u64;
+    verify_pair(&TwoViewParams::default(), posture, &rays[a], &rays[b], matches, seed)
 }
 
 impl Street {
@@ -146,15 +153,7 @@ impl Street {
         for a in 0..self.features.len() {
             for b in a + 1..self.features.len() {
                 let matches = self.matches(a, b, &mut rng);
-                let posture = Posture::of([&cameras[a], &cameras[b]]);
-                for two_view in verify_pair(
-                    &TwoViewParams::default(),
-                    posture,
-                    &rays[a],
-                    &rays[b],
-                    &matches,
-                    (a * 100 + b) as u64,
-                ) {
+                for two_view in verified(cameras, &rays, [a, b], &matches) {
                     pairs.push(PairGeometry {
                         first: ImageId(a as u32),
                         second: ImageId(b as u32),
@@ -580,15 +579,7 @@ impl Street {
                     }
                 }
                 let (first, second) = (ImageId(a as u32), ImageId(b as u32));
-                let posture = Posture::of([&self.cameras[a], &self.cameras[b]]);
-                for two_view in verify_pair(
-                    &TwoViewParams::default(),
-                    posture,
-                    &rays[a],
-                    &rays[b],
-                    &matches,
-                    (a * 100 + b) as u64,
-                ) {
+                for two_view in verified(&self.cameras, &rays, [a, b], &matches) {
                     pairs.push(PairGeometry { first, second, two_view });
                 }
                 putative.push(PutativePair { first, second, matches });

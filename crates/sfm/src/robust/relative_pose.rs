@@ -6,7 +6,7 @@ use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
 use super::ransac::{Consensus, Consented, RansacParams, distinct, lo_ransac, lo_ransac_from};
 use super::residual::AngularResidual;
 use crate::Rigid;
-use crate::solvers::essential::{depth_signs, rotations_of_essential};
+use crate::solvers::essential::{is_in_front, rotations_of_essential};
 use crate::solvers::{five_point, tangent_basis, upright_three_point};
 
 /// The relative pose of two views and who supports it.
@@ -227,11 +227,7 @@ impl Consensus for RelativeConsensus<'_> {
         let (first, second) = (sample.map(|i| self.first[i]), sample.map(|i| self.second[i]));
         for essential in &five_point(&first, &second) {
             for (rotation, translation) in &rotations_of_essential(essential) {
-                let supports = first.iter().zip(&second).all(|(a, b)| {
-                    let (near, far) = depth_signs(&(rotation * a), translation, b);
-                    near > 0.0 && far > 0.0
-                });
-                if supports {
+                if first.iter().zip(&second).all(|(a, b)| is_in_front(&(rotation * a), translation, b)) {
                     models.push(SecondFromFirst { rotation: *rotation, translation: *translation });
                 }
             }
@@ -244,8 +240,7 @@ impl Consensus for RelativeConsensus<'_> {
         let squared = term.error * term.error / term.variance;
         if squared < bound {
             let second = &self.second[index];
-            let (near, far) = depth_signs(&term.rotated, &model.translation, second);
-            if !(near > 0.0 && far > 0.0) {
+            if !is_in_front(&term.rotated, &model.translation, second) {
                 let (a, b) = self.variances[index];
                 let sine_squared = second.cross(&term.rotated).norm_squared();
                 let parallel = sine_squared < PARALLEL_SIGMA * PARALLEL_SIGMA * (a + b);
@@ -388,11 +383,7 @@ impl Consensus for TurnedConsensus<'_> {
         let [a, b] = rays.map(|(first, second)| first.cross(&second));
         let Some(along) = a.cross(&b).try_normalize(1e-12) else { return };
         for translation in [along, -along] {
-            let is_before = rays.iter().all(|(first, second)| {
-                let (near, far) = depth_signs(first, &translation, second);
-                near > 0.0 && far > 0.0
-            });
-            if is_before {
+            if rays.iter().all(|(first, second)| is_in_front(first, &translation, second)) {
                 models.push(SecondFromFirst { rotation: self.rotation, translation });
             }
         }

@@ -55,6 +55,13 @@ pub fn depth_signs(rotated: &Vector3<f64>, translation: &Vector3<f64>, second: &
     (translation.cross(second).dot(&normal), translation.cross(rotated).dot(&normal))
 }
 
+/// Whether both depths of [`depth_signs`] are positive.
+#[inline]
+pub fn is_in_front(rotated: &Vector3<f64>, translation: &Vector3<f64>, second: &Vector3<f64>) -> bool {
+    let (near, far) = depth_signs(rotated, translation, second);
+    near > 0.0 && far > 0.0
+}
+
 /// The pose of an essential matrix for which most pairs have two positive depths, with their number.
 ///
 /// Ties go to the first in the order of [`poses_of_essential`].
@@ -65,14 +72,8 @@ pub fn pose_by_depth_signs(
 ) -> Option<(Rigid, usize)> {
     let mut best: Option<(Matrix3<f64>, Vector3<f64>, usize)> = None;
     for (rotation, translation) in &rotations_of_essential(essential) {
-        let votes = first
-            .iter()
-            .zip(second)
-            .filter(|(a, b)| {
-                let (near, far) = depth_signs(&(rotation * **a), translation, b);
-                near > 0.0 && far > 0.0
-            })
-            .count();
+        let votes =
+            first.iter().zip(second).filter(|(a, b)| is_in_front(&(rotation * **a), translation, b)).count();
         if best.as_ref().is_none_or(|(_, _, most)| votes > *most) {
             best = Some((*rotation, *translation, votes));
         }

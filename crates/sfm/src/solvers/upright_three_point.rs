@@ -1,7 +1,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::polynomial::real_roots;
-use super::{Solutions, essential::depth_signs};
+use super::{Solutions, essential::is_in_front};
 
 /// Poses `second_from_first` from three pairs of bearings, where both cameras stand upright: their y axes are
 /// vertical, so that `second_from_first` turns about y alone.
@@ -49,11 +49,7 @@ pub fn upright_three_point(
         let (cosine, sine) = ((1.0 - q * q) * scale, 2.0 * q * scale);
         let rotation = Matrix3::new(cosine, 0.0, sine, 0.0, 1.0, 0.0, -sine, 0.0, cosine);
         for translation in [along, -along] {
-            let is_in_front = first.iter().zip(second).all(|(a, b)| {
-                let (near, far) = depth_signs(&(rotation * a), &translation, b);
-                near > 0.0 && far > 0.0
-            });
-            if is_in_front {
+            if first.iter().zip(second).all(|(a, b)| is_in_front(&(rotation * a), &translation, b)) {
                 poses.push((rotation, translation));
             }
         }
