@@ -30,13 +30,14 @@ mod support;
 mod test_street;
 mod told;
 mod triplets;
+mod turned;
 mod votes;
 pub(crate) mod wall;
 mod witnesses;
 
 use std::{cmp::Reverse, collections::BTreeMap};
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use setloc_features::{Calibration, Camera, ImageFeatures, Match};
@@ -49,7 +50,7 @@ pub use self::{
 };
 
 use self::{
-    adjust::{Scope, adjust, is_adjustable},
+    adjust::{Scope, adjust},
     ambiguity::settle_pose,
     calibration::calibrate,
     continuation::{Continued, continue_planes},
@@ -84,7 +85,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 46;
+pub const MAPPER_VERSION: u32 = 47;
 
 /// How to build a model from verified pairs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -117,7 +118,7 @@ pub struct MapperParams {
     pub min_visible_points: usize,
     /// Fewest matches of a pure rotation that registers an image at the standpoint of another.
     pub min_turn_matches: usize,
-    /// Smallest share of the keypoints that two photos ought to share after a turn that must match for them to count as
+    /// Smallest share of the keypoints that two images ought to share after a turn that must match for them to count as
     /// taken from one standpoint.
     pub min_turn_recall: f64,
     /// Rotation from a verified pair's that still counts as agreement with it, in degrees.
@@ -598,9 +599,10 @@ impl<'a> Mapper<'a> {
             triangulate_image(&mut self.model, &self.graph, self.params.limits(), image);
             settle_pose(&mut self.model, &self.graph, self.params, image, self.seed);
             let count = self.model.registered_count();
-            if count as f64 >= self.images_at_last_global as f64 * self.params.global_bundle_growth
-                || count <= 4
-            {
+            let has_grown =
+                count as f64 >= self.images_at_last_global as f64 * self.params.global_bundle_growth;
+            // Who is taken out and comes in again makes it no larger.
+            if has_grown || count <= 4 && count > self.images_at_last_global {
                 self.refine(1, 10);
                 self.images_at_last_global = count;
                 self.expel_misplaced();
@@ -613,35 +615,6 @@ impl<'a> Mapper<'a> {
         self.calibrate_waiting();
         let (image, hypothesis) = self.next_image()?;
         register(&mut self.model, image, &hypothesis);
-        Some(image)
-    }
-
-    /// Registers an image at the standpoint of one that it is a mere turn away from.
-    ///
-    /// Photos taken by turning on the spot share no parallax, so they have no points in common to resect from; but the
-    /// turn itself is known best of all, and through it the next standpoint's matches reach the model.
-    fn register_by_turn(&mut self) -> Option<ImageId> {
-        let mut best: Option<(usize, ImageId, ImageId, UnitQuaternion<f64>)> = None;
-        for pair in self.model.input.pairs {
-            let matches = pair.two_view.inliers.len();
-            if pair.two_view.kind != TwoViewKind::PureRotation || matches < self.params.min_turn_matches {
-                continue;
-            }
-            for image in [pair.second, pair.first] {
-                let Some((anchor, image_from_anchor)) = pair.seen_from(image) else { continue };
-                let open = !self.model.is_registered(image)
-                    && !self.taken[image.index()]
-                    && self.anchors[image.index()].is_none()
-                    && self.model.is_registered(anchor)
-                    && self.knows_camera_of(image);
-                if open && best.is_none_or(|(most, ..)| matches > most) {
-                    best = Some((matches, image, anchor, image_from_anchor.rotation));
-                }
-            }
-        }
-        let (_, image, anchor, image_from_anchor) = best?;
-        self.anchors[image.index()] = Some((anchor, image_from_anchor));
-        self.place_by_turn(image);
         Some(image)
     }
 
@@ -790,27 +763,6 @@ impl<'a> Mapper<'a> {
         }
     }
 
-    fn place_by_turn(&mut self, image: ImageId) {
-        if let Some((anchor, image_from_anchor)) = self.anchors[image.index()]
-            && let Some(pose) = &self.model.poses[anchor.index()]
-        {
-            let world_from_anchor = pose.world_from_camera;
-            let rotation = world_from_anchor.rotation * image_from_anchor.inverse();
-            self.model.set_pose(image, Some(Rigid::new(rotation, world_from_anchor.translation)));
-        }
-    }
-
-    /// Images with too few points to be adjusted stay with the image that they were turned from. Returns those moved.
-    fn follow_anchors(&mut self) -> Vec<ImageId> {
-        let follows =
-            |image: &ImageId| self.anchors[image.index()].is_some() && !is_adjustable(&self.model, *image);
-        let followers: Vec<ImageId> = self.model.registered().filter(follows).collect();
-        for &image in &followers {
-            self.place_by_turn(image);
-        }
-        followers
-    }
-
     fn filter_all(&mut self, limits: PointLimits) -> usize {
         let points = self.model.live_ids();
         filter(&mut self.model, limits, &points)
@@ -825,12 +777,7 @@ impl<'a> Mapper<'a> {
         let mut waiting: Vec<(usize, ImageId)> = open
             .into_par_iter()
             .with_max_len(1)
-            .map(|image| {
-                let count = count_scene_matches(&self.model, &self.graph, image);
-                let of_pairs =
-                    if self.admits_latecomers { count_held_by_pairs(&self.model, image) } else { 0 };
-                (count.max(of_pairs), image)
-            })
+            .map(|image| (self.count_offered(image), image))
             .filter(|&(count, image)| {
                 count >= self.params.min_confirmed_inliers.min(self.params.min_registration_inliers)
                     && count > self.refused_at[image.index()] * 11 / 10
@@ -1082,7 +1029,13 @@ impl<'a> Mapper<'a> {
         let points = self.model.observed_points(image);
         self.records.push(RegistrationRecord::new(image, false, [points, points], seen));
         self.model.unregister(image);
-        self.refused_at[image.index()] = count_scene_matches(&self.model, &self.graph, image);
+        self.refused_at[image.index()] = self.count_offered(image);
+    }
+
+    /// Matches by which an image that waits may come in: one that was refused is asked again when there are more.
+    fn count_offered(&self, image: ImageId) -> usize {
+        let of_pairs = if self.admits_latecomers { count_held_by_pairs(&self.model, image) } else { 0 };
+        count_scene_matches(&self.model, &self.graph, image).max(of_pairs)
     }
 
     /// The panoramas whose pairs speak most against their place, where that is untenable: one or a few that belong together.
@@ -1206,6 +1159,7 @@ impl<'a> Mapper<'a> {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::UnitQuaternion;
     use rand::Rng;
     use setloc_features::Keypoint;
 

@@ -246,8 +246,6 @@ pub fn assess(
     let points_of = sum(|counts| &counts.points_of, n);
     // Of the geometries of one pair the model can have one only.
     let mut judged: BTreeMap<(ImageId, ImageId), (PairDisagreement, bool)> = BTreeMap::new();
-    // What photos turned on the spot share becomes no points.
-    let mut turned: BTreeSet<(ImageId, ImageId)> = BTreeSet::new();
     for pair in pairs {
         let poses = (
             reconstruction.images[pair.first.index()].world_from_camera,
@@ -269,10 +267,10 @@ pub fn assess(
         let is_turned = found.rotation_deg > params.max_rotation_deg
             && two_view.kind == TwoViewKind::General
             && !found.is_explained();
-        let agrees = !found.is_unused() && !is_turned;
-        if two_view.kind == TwoViewKind::PureRotation && found.rotation_deg <= params.max_rotation_deg {
-            turned.insert((pair.first, pair.second));
-        }
+        // What images share that were turned on the spot becomes no points.
+        let is_mere_turn =
+            two_view.kind == TwoViewKind::PureRotation && found.rotation_deg <= params.max_rotation_deg;
+        let agrees = is_mere_turn || !found.is_unused() && !is_turned;
         let (kept, any_agrees) =
             judged.entry((pair.first, pair.second)).or_insert_with(|| (found.clone(), false));
         *any_agrees |= agrees;
@@ -284,8 +282,7 @@ pub fn assess(
     let disagreements = judged.into_values().filter(|(_, any_agrees)| !any_agrees);
     report.disagreements = disagreements.map(|(found, _)| found).collect();
     let links = strongest_links(n, |a, b| shared[a * n + b].max(shared[b * n + a]));
-    let is_mere_turn = |pair: &PairDisagreement| turned.contains(&(pair.first, pair.second));
-    let heavy = report.disagreements.iter().filter(|pair| pair.is_heavy() && !is_mere_turn(pair));
+    let heavy = report.disagreements.iter().filter(|pair| pair.is_heavy());
     report.outvoted = heavy.filter_map(|pair| outvoted(pair, n, &links)).collect();
     for first in reconstruction.registered() {
         for second in reconstruction.registered().filter(|&second| second > first) {
@@ -597,15 +594,16 @@ mod tests {
                 covariance: None,
             });
         }
-        let outvoted = |kind| {
+        let report = |kind| {
             let inliers = (0..300).map(|at| Match { first: at, second: at }).collect();
             let two_view =
                 TwoView { kind, second_from_first: Rigid::identity(), inliers, median_parallax_rad: 0.0 };
             let pair = PairGeometry { first: ImageId(0), second: ImageId(1), two_view };
-            assess(&QualityParams::default(), &model, &[pair]).outvoted
+            assess(&QualityParams::default(), &model, &[pair])
         };
-        assert_eq!(outvoted(TwoViewKind::PureRotation), []);
-        let found = outvoted(TwoViewKind::General);
+        let of_turn = report(TwoViewKind::PureRotation);
+        assert_eq!((of_turn.disagreements, of_turn.outvoted), (vec![], vec![]));
+        let found = report(TwoViewKind::General).outvoted;
         assert_eq!(found.iter().map(|pair| (pair.matches, pair.held_by)).collect::<Vec<_>>(), [(300, 9)]);
     }
 

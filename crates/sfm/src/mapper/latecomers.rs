@@ -24,8 +24,8 @@ use crate::{
 
 /// Largest part whose images are asked whether they belong to a larger one.
 pub(super) const FEW_IMAGES: usize = 3;
-/// How many times more matches the strongest pair of each image of a part must have with an image elsewhere than the strongest
-/// within for the part to be asked, too.
+/// How many times more matches the strongest pair of an image of a part must have with an image elsewhere than the strongest
+/// within for it to belong there.
 const ELSEWHERE_LEAD: usize = 2;
 /// Pairs of an image, the strongest, whose directions are crossed with each other.
 const CROSSED_PAIRS: usize = 12;
@@ -39,22 +39,21 @@ const MIN_CROSSING_RAD: f64 = 0.1;
 /// In a rendered floor the strongest pair of each of four images of a part that was wrong in itself (4.2 m) had 48 to 99 matches
 /// within it and 272 to 310 with an image of another part; of right parts it is within.
 pub(super) fn may_be_left(input: &MapperInput<'_>, part: &Part) -> bool {
-    if part.size() <= FEW_IMAGES {
-        return true;
-    }
-    let is_inside = |image: ImageId| part.component.images[image.index()].world_from_camera.is_some();
-    let mut strongest = vec![[0; 2]; input.images.len()];
+    part.size() <= FEW_IMAGES
+        || part.component.registered().all(|image| belongs_elsewhere(input, part, image))
+}
+
+/// Whether the strongest pair of an image of a part is by far with an image that the part does not hold.
+pub(super) fn belongs_elsewhere(input: &MapperInput<'_>, part: &Part, image: ImageId) -> bool {
+    let mut strongest = [0; 2];
     for pair in input.pairs {
-        let within = usize::from(is_inside(pair.first) == is_inside(pair.second));
-        for image in [pair.first, pair.second] {
-            let most = &mut strongest[image.index()][within];
-            *most = pair.two_view.inliers.len().max(*most);
-        }
+        let Some((other, _)) = pair.seen_from(image) else { continue };
+        let is_within = part.component.images[other.index()].world_from_camera.is_some();
+        let most = &mut strongest[usize::from(is_within)];
+        *most = pair.two_view.inliers.len().max(*most);
     }
-    part.component.registered().all(|image| {
-        let [elsewhere, within] = strongest[image.index()];
-        elsewhere >= ELSEWHERE_LEAD * within
-    })
+    let [elsewhere, within] = strongest;
+    elsewhere >= ELSEWHERE_LEAD * within
 }
 
 /// A verified pair of the image that is sought and a registered one.

@@ -31,6 +31,7 @@ use self::{
 use super::{
     Mapper, MapperParams, MapperReport,
     depths::is_indoors,
+    latecomers::belongs_elsewhere,
     model::Model,
     neighbours::{Neighbours, neighbours, share_as_neighbours},
     parts::{Part, Parts},
@@ -234,7 +235,7 @@ impl Parts<'_> {
 }
 
 /// What tells a part from all others and from itself before it grew: its first image and its size.
-type PartState = (Option<ImageId>, usize);
+pub(super) type PartState = (Option<ImageId>, usize);
 
 /// What parts are joined by.
 #[derive(Debug, Clone, Copy)]
@@ -246,7 +247,7 @@ enum Evidence {
 }
 
 impl Part {
-    fn state(&self) -> PartState {
+    pub(super) fn state(&self) -> PartState {
         (self.component.registered().next(), self.size())
     }
 }
@@ -658,7 +659,9 @@ impl<'a> Attempt<'_, '_, 'a> {
             mapper.refine(2, 20);
         }
         mapper.replace_misplaced();
-        self.all_stay(&mapper).then_some(mapper)
+        // Where a part ends an image may have come in askew by a few points, which the other part has hundreds of matches with.
+        let may_leave = |part: &Part, image| belongs_elsewhere(mapper.model.input, part, image);
+        self.keeps_images(&mapper, may_leave).then_some(mapper)
     }
 
     /// The model of both, that images may join but those that are taken.
@@ -675,11 +678,12 @@ impl<'a> Attempt<'_, '_, 'a> {
         mapper
     }
 
-    /// Whether all images of both are still in the whole.
-    fn all_stay(&self, mapper: &Mapper<'_>) -> bool {
-        [self.kept, self.moved]
-            .iter()
-            .all(|part| part.component.registered().all(|image| mapper.model.is_registered(image)))
+    /// Whether all images of both are still in the whole, but for those that may leave their part.
+    fn keeps_images(&self, mapper: &Mapper<'_>, may_leave: impl Fn(&Part, ImageId) -> bool) -> bool {
+        [self.kept, self.moved].into_iter().all(|part| {
+            let mut images = part.component.registered();
+            images.all(|image| mapper.model.is_registered(image) || may_leave(part, image))
+        })
     }
 
     /// Whether the adjusted whole keeps what either component saw.

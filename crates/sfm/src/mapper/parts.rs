@@ -1,12 +1,12 @@
 //! The parts that a place is mapped in: made one after the other, joined, grown again and handed over.
 
-use std::cmp::Reverse;
+use std::{cmp::Reverse, collections::BTreeSet};
 
 use nalgebra::UnitQuaternion;
 
 use super::{
-    Mapper, MapperInput, MapperOutput, MapperParams, MapperReport, latecomers::may_be_left, model::Model,
-    projection, witnesses::Witnesses,
+    Mapper, MapperInput, MapperOutput, MapperParams, MapperReport, latecomers::may_be_left, merge::PartState,
+    model::Model, projection, witnesses::Witnesses,
 };
 use crate::{ImageId, Reconstruction, ReconstructionImage};
 
@@ -108,7 +108,9 @@ impl<'a> Parts<'a> {
         }
         parts.join_supported();
         parts.admit_latecomers();
-        while params.join_by_depths && parts.join_hung() {
+        // What is split off one part may come together again.
+        let mut known = BTreeSet::new();
+        while params.join_by_depths && parts.join_hung() && known.insert(parts.states()) {
             parts.admit_latecomers();
         }
         parts
@@ -120,6 +122,10 @@ impl<'a> Parts<'a> {
         'a: 'b,
     {
         Parts { params: self.params, input, seed: self.seed, all: self.all, report: self.report }
+    }
+
+    fn states(&self) -> Vec<PartState> {
+        self.all.iter().map(Part::state).collect()
     }
 
     pub fn sort(&mut self) {
