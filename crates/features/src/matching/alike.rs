@@ -45,6 +45,10 @@ const NUM_GROUPS: usize = 4 * SECTORS;
 /// A bit for each group.
 type Groups = u64;
 
+/// Bits of a keypoint's index, beside those of its group and its extent.
+const INDEX_BITS: u32 = 26;
+const INDEX_MASK: u64 = (1 << INDEX_BITS) - 1;
+
 /// What of a keypoint in a level image tells which keypoints of another show the same.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Aspect {
@@ -79,6 +83,17 @@ impl Aspect {
             group: zone as usize * SECTORS + sector,
             extent: (angle / height).max(f32::MIN_POSITIVE).log2(),
         }
+    }
+
+    /// Where the keypoint of this index is sorted in, that index in the last bits.
+    ///
+    /// Every other group is backwards: a block with the end of one and the beginning of the next is of like extents.
+    fn place(&self, index: usize) -> u64 {
+        let along = if self.group.is_multiple_of(2) { self.extent } else { -self.extent };
+        let bits = along.to_bits();
+        // Integers in the order of the numbers that these are the bits of.
+        let ordered = if along.is_sign_negative() { !bits } else { bits | 1 << 31 };
+        (self.group as u64) << (INDEX_BITS + 32) | u64::from(ordered) << INDEX_BITS | index as u64
     }
 
     fn is_compared_with(&self, other: &Self) -> bool {
@@ -128,15 +143,15 @@ struct Sorted {
 
 impl Sorted {
     fn new(features: &ImageFeatures, part: Range<usize>, elevations: Elevations) -> Self {
-        let mut keypoints: Vec<(Aspect, u32)> =
-            part.map(|at| (Aspect::of(&features.keypoints[at], elevations), at as u32)).collect();
-        // Every other group backwards: a block with the end of one and the beginning of the next is of like extents.
-        let along =
-            |aspect: &Aspect| if aspect.group.is_multiple_of(2) { aspect.extent } else { -aspect.extent };
-        keypoints.sort_by(|(a, at), (b, other)| {
-            a.group.cmp(&b.group).then(along(a).total_cmp(&along(b))).then(at.cmp(other))
-        });
-        let (aspects, order): (Vec<_>, Vec<_>) = keypoints.into_iter().unzip();
+        let of_part: Vec<Aspect> = features.keypoints[part.clone()]
+            .iter()
+            .map(|keypoint| Aspect::of(keypoint, elevations))
+            .collect();
+        let mut places: Vec<u64> = of_part.iter().enumerate().map(|(at, aspect)| aspect.place(at)).collect();
+        places.sort_unstable();
+        let within: Vec<usize> = places.into_iter().map(|place| (place & INDEX_MASK) as usize).collect();
+        let aspects = within.iter().map(|&at| of_part[at]).collect();
+        let order: Vec<u32> = within.into_iter().map(|at| (part.start + at) as u32).collect();
         let mut descriptors = Vec::with_capacity(order.len() * DESCRIPTOR_LEN);
         for &at in &order {
             descriptors.extend(halved(features.descriptor(at as usize)));
