@@ -70,8 +70,8 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// that share one have focal lengths of their own. 32: a set's scale by the walls that its photos show. 33: errors that
 /// directions of the scene's images share. 34: and how these change the stretch of panoramas. 35: focal lengths that a
 /// set's photos contradict; walls by what is more alike. 36: what matches err alike. 37: wrong matches do not stand for the
-/// noise of right ones.
-pub const VERSION: u32 = 38;
+/// noise of right ones. 38: photos that are stretched. 39: pictures of walls by the luma that JPEGs store.
+pub const VERSION: u32 = 39;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

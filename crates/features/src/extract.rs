@@ -1,12 +1,12 @@
 use std::cmp::Ordering;
 
-use opencv::core::{Mat, Size};
 use serde::{Deserialize, Serialize};
 
 use crate::error::check;
-use crate::sift::{self, SiftParams, SiftPoint, detect_and_describe};
+use crate::sift::{SiftParams, SiftPoint, detect_and_describe};
 use crate::{
-    Camera, DESCRIPTOR_NORM, DecodedImage, FeatureError, ImageFeatures, Keypoint, Mask, SimulatedView,
+    Camera, DESCRIPTOR_NORM, DecodedImage, FeatureError, GreyImage, ImageFeatures, Keypoint, Mask,
+    SimulatedView,
 };
 
 /// How to detect and describe points.
@@ -148,7 +148,7 @@ pub fn extract(
             height: camera.height,
         });
     }
-    let grey = Grey::new(image).reduced(params.max_side)?;
+    let grey = GreyImage::from(image).reduced(params.max_side)?;
     let padding = if camera.wraps_around() { grey.width / SEAM_SHARE } else { 0 };
     let scale = [width as f32 / grey.width as f32, height as f32 / grey.height as f32];
     let grey = grey.wrapped(padding);
@@ -188,7 +188,7 @@ impl Source<'_> {
     /// how many of them are light, and how many there are of the usual contrast, chosen or not.
     fn append_view(
         &self,
-        view: &Grey,
+        view: &GreyImage,
         factor: [f32; 2],
         budget: usize,
         features: &mut ImageFeatures,
@@ -278,73 +278,6 @@ struct Candidate {
     y: f32,
     response: f32,
     is_light: bool,
-}
-
-/// Luma of ITU-R BT.601 of one RGB pixel, in 14-bit integers.
-pub(crate) fn luma(pixel: &[u8]) -> u8 {
-    let sum = 4899 * u32::from(pixel[0]) + 9617 * u32::from(pixel[1]) + 1868 * u32::from(pixel[2]);
-    ((sum + (1 << 13)) >> 14) as u8
-}
-
-/// A grey image for the detector.
-struct Grey {
-    width: usize,
-    height: usize,
-    values: Vec<u8>,
-}
-
-impl Grey {
-    fn new(image: &DecodedImage) -> Self {
-        let values = image.rgb.chunks_exact(3).map(luma).collect();
-        Self { width: image.width as usize, height: image.height as usize, values }
-    }
-
-    /// Reduced by averaging so that no side is longer than `max_side`.
-    fn reduced(self, max_side: u32) -> Result<Self, FeatureError> {
-        let longer = self.width.max(self.height);
-        if longer <= max_side as usize {
-            return Ok(self);
-        }
-        let share = f64::from(max_side) / longer as f64;
-        self.resized([share, share])
-    }
-
-    /// Reduced by averaging, by these shares of its width and height.
-    fn resized(&self, share: [f64; 2]) -> Result<Self, FeatureError> {
-        let side = |side: usize, share: f64| ((side as f64 * share).round() as usize).max(1);
-        let (width, height) = (side(self.width, share[0]), side(self.height, share[1]));
-        let mut values = vec![0; width * height];
-        let mut run = || {
-            let source = Mat::new_rows_cols_with_data(self.height as i32, self.width as i32, &self.values)?;
-            let mut target = Mat::new_rows_cols_with_data_mut(height as i32, width as i32, &mut values)?;
-            let size = Size::new(width as i32, height as i32);
-            opencv::imgproc::resize(&source, &mut target, size, 0.0, 0.0, opencv::imgproc::INTER_AREA)
-        };
-        run().map_err(|error| detector_error(&error))?;
-        Ok(Self { width, height, values })
-    }
-
-    fn view(&self) -> sift::Grey<'_> {
-        sift::Grey { width: self.width, height: self.height, values: &self.values }
-    }
-
-    /// With `padding` columns of the other side left and right.
-    fn wrapped(self, padding: usize) -> Self {
-        if padding == 0 {
-            return self;
-        }
-        let mut values = Vec::with_capacity((self.width + 2 * padding) * self.height);
-        for row in self.values.chunks_exact(self.width) {
-            values.extend_from_slice(&row[self.width - padding..]);
-            values.extend_from_slice(row);
-            values.extend_from_slice(&row[..padding]);
-        }
-        Self { width: self.width + 2 * padding, height: self.height, values }
-    }
-}
-
-fn detector_error(error: &opencv::Error) -> FeatureError {
-    FeatureError::Detector { reason: error.message.clone() }
 }
 
 /// The strongest of each cell up to an even share, then the strongest of the rest; strongest first.

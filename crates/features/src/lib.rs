@@ -50,6 +50,7 @@ mod error;
 mod extract;
 mod features;
 mod geodesy;
+mod grey;
 mod mask;
 mod matching;
 mod nearby;
@@ -63,12 +64,13 @@ pub use camera::{
 };
 pub use decode::{
     CameraSource, DecodeLimits, DecodedImage, GPano, GeoPosition, ImageInfo, ImageMetadata, decode,
-    guess_camera, probe,
+    decode_grey, guess_camera, probe,
 };
 pub use error::FeatureError;
 pub use extract::{FeatureParams, extract, keypoint_noise_px};
 pub use features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Keypoint, Rays, SimulatedView};
 pub use geodesy::Wgs84;
+pub use grey::GreyImage;
 pub use mask::Mask;
 pub use matching::{
     DescriptorBlock, Elevations, GuidedParams, Match, MatchParams, Posture, TwoNearest, match_features,

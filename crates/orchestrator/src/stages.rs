@@ -7,7 +7,7 @@ use setloc_town::TownParams;
 
 pub use setloc_features::{
     DecodeLimits, DecodedImage, FeatureParams, ImageInfo, ImagePyramid, Mask, MatchParams, Posture, decode,
-    extract, guess_camera, match_features, probe,
+    decode_grey, extract, guess_camera, match_features, probe,
 };
 
 /// Version of decoding and extraction; part of the fingerprint of `features` jobs.

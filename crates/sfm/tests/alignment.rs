@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
 use rand::Rng;
-use setloc_features::{Camera, DecodedImage, ImageFeatures, ImagePyramid, Keypoint};
+use setloc_features::{Camera, GreyImage, ImageFeatures, ImagePyramid, Keypoint};
 use setloc_sfm::synthetic::{normal, normal_vector, random_rotation, random_unit, seeded};
 use setloc_sfm::{
     AlignmentParams, AlignmentReport, CameraId, ImageId, Observation, Reconstruction, ReconstructionImage,
@@ -53,15 +53,15 @@ impl Room {
             .iter()
             .map(|pose| {
                 let pixels = (0..320).flat_map(|y| (0..640).map(move |x| (x, y)));
-                let rgb = pixels
-                    .flat_map(|(x, y)| {
+                let values = pixels
+                    .map(|(x, y)| {
                         let pixel = Vector2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
                         let ray = pose.rotation * lens.unproject(&pixel).expect("a panorama sees everywhere");
-                        [paint(&wall(&pose.translation, &ray)).round() as u8; 3]
+                        paint(&wall(&pose.translation, &ray)).round() as u8
                     })
                     .collect();
-                let image = DecodedImage::from_rgb(640, 320, rgb).expect("as many bytes as pixels");
-                Arc::new(ImagePyramid::new(&image, camera.wraps_around()))
+                let image = GreyImage::from_values(640, 320, values).expect("as many values as pixels");
+                Arc::new(ImagePyramid::new(image, camera.wraps_around()))
             })
             .collect();
         let mut features = vec![ImageFeatures { width: 640, height: 320, ..ImageFeatures::default() }; 4];
@@ -183,8 +183,8 @@ fn the_result_has_the_same_bytes_with_any_number_of_threads() {
 #[test]
 fn keypoints_without_their_surroundings_stay() {
     let mut room = Room::new("keypoints_without_their_surroundings_stay");
-    let grey = DecodedImage::from_rgb(640, 320, vec![90; 640 * 320 * 3]).unwrap();
-    let grey = Arc::new(ImagePyramid::new(&grey, true));
+    let grey = GreyImage::from_values(640, 320, vec![90; 640 * 320]).unwrap();
+    let grey = Arc::new(ImagePyramid::new(grey, true));
     room.pyramids.fill(grey);
     let (model, report) = room.align(&AlignmentParams::default());
     let by_keypoints = AlignmentParams { max_shift_sigma: 0.0, ..AlignmentParams::default() };

@@ -4,7 +4,7 @@ use std::convert::Infallible;
 use std::sync::Arc;
 
 use nalgebra::{Matrix6, UnitQuaternion, Vector2, Vector3};
-use setloc_features::{Camera, DecodedImage, ImageFeatures, ImagePyramid, Keypoint, Match};
+use setloc_features::{Camera, GreyImage, ImageFeatures, ImagePyramid, Keypoint, Match};
 use setloc_sfm::{
     BaselineLength, CameraId, ImageId, Observation, PairGeometry, Reconstruction, ReconstructionImage,
     ReconstructionPoint, Rigid, StepPose, TwoView, TwoViewKind, register_by_ground, sharpen_lengths,
@@ -47,14 +47,14 @@ fn render(camera: &Camera, world_from_camera: &Rigid, salt: u64) -> Arc<ImagePyr
     };
     let offsets = [-0.375, -0.125, 0.125, 0.375];
     let pixels = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
-    let rgb = pixels.flat_map(|(x, y)| {
+    let values = pixels.map(|(x, y)| {
         let middle = Vector2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
         let samples = offsets.iter().flat_map(|dy| offsets.map(|dx| middle + Vector2::new(dx, *dy)));
         let mean = samples.map(|pixel| value(&pixel)).sum::<f64>() / 16.0;
-        [mean.round() as u8; 3]
+        mean.round() as u8
     });
     Arc::new(ImagePyramid::new(
-        &DecodedImage::from_rgb(camera.width, camera.height, rgb.collect())
+        GreyImage::from_values(camera.width, camera.height, values.collect())
             .expect("as many values as pixels"),
         false,
     ))

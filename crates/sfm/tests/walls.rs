@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector2, Vector3};
-use setloc_features::{Camera, CameraModel, DecodedImage, ImagePyramid};
+use setloc_features::{Camera, CameraModel, GreyImage, ImagePyramid};
 use setloc_sfm::{
     CameraId, DistantPhoto, ImageId, Observation, Reconstruction, ReconstructionImage, ReconstructionPoint,
     Rigid, ScaleByWalls, scale_by_walls,
@@ -54,9 +54,9 @@ impl Street {
             let spot = Self::hit(&pose.translation, &(pose.rotation * camera.unproject(&place)?));
             spot.map(|spot| self.grey(&spot) as u8)
         };
-        let rgb = (0..camera.width * camera.height).flat_map(|at| [pixel(at).unwrap_or(128); 3]).collect();
-        let image = DecodedImage::from_rgb(camera.width, camera.height, rgb).unwrap();
-        Arc::new(ImagePyramid::new(&image, camera.wraps_around()))
+        let values = (0..camera.width * camera.height).map(|at| pixel(at).unwrap_or(128)).collect();
+        let image = GreyImage::from_values(camera.width, camera.height, values).unwrap();
+        Arc::new(ImagePyramid::new(image, camera.wraps_around()))
     }
 }
 

@@ -11,17 +11,42 @@ const FORMAT_MAX_SIDE: usize = 65_535;
 
 /// Width, height and RGB of a complete JPEG.
 pub(super) fn decode(bytes: &[u8], limits: &DecodeLimits) -> Result<(u32, u32, Vec<u8>), FeatureError> {
+    decode_as(ColorSpace::RGB, checked_size(bytes, limits)?, bytes)
+}
+
+/// Width, height and luma of a complete JPEG; `None` where the luma is not stored apart.
+pub(super) fn decode_luma(
+    bytes: &[u8],
+    limits: &DecodeLimits,
+) -> Result<Option<(u32, u32, Vec<u8>)>, FeatureError> {
+    let size = checked_size(bytes, limits)?;
+    let mut headers = decoder(bytes, ColorSpace::Luma);
+    headers.decode_headers().map_err(|error| damaged(&format!("{error:?}")))?;
+    let is_apart = matches!(headers.input_colorspace(), Some(ColorSpace::YCbCr | ColorSpace::Luma));
+    is_apart.then(|| decode_as(ColorSpace::Luma, size, bytes)).transpose()
+}
+
+/// Width and height of a JPEG that is complete and within the limits.
+fn checked_size(bytes: &[u8], limits: &DecodeLimits) -> Result<(u32, u32), FeatureError> {
     let (width, height) = size(bytes)?;
     limits.check(width.into(), height.into())?;
     // A lenient decoder fills what is missing with grey, so the end marker is looked for first.
     if !is_complete(bytes) {
         return Err(FeatureError::Truncated { format: "JPEG" });
     }
-    let rgb = decoder(bytes).decode().map_err(|error| damaged(&format!("{error:?}")))?;
-    if rgb.len() != width as usize * height as usize * 3 {
+    Ok((width, height))
+}
+
+fn decode_as(
+    colors: ColorSpace,
+    (width, height): (u32, u32),
+    bytes: &[u8],
+) -> Result<(u32, u32, Vec<u8>), FeatureError> {
+    let values = decoder(bytes, colors).decode().map_err(|error| damaged(&format!("{error:?}")))?;
+    if values.len() != width as usize * height as usize * colors.num_components() {
         return Err(damaged("unexpected number of colour channels"));
     }
-    Ok((width, height, rgb))
+    Ok((width, height, values))
 }
 
 /// Width and height as the frame header says.
@@ -38,9 +63,9 @@ pub(super) fn app1_segments(bytes: &[u8]) -> Vec<&[u8]> {
     scan(bytes).app1
 }
 
-fn decoder(bytes: &[u8]) -> JpegDecoder<ZCursor<&[u8]>> {
+fn decoder(bytes: &[u8], colors: ColorSpace) -> JpegDecoder<ZCursor<&[u8]>> {
     let options = DecoderOptions::default()
-        .jpeg_set_out_colorspace(ColorSpace::RGB)
+        .jpeg_set_out_colorspace(colors)
         .set_max_width(FORMAT_MAX_SIDE)
         .set_max_height(FORMAT_MAX_SIDE)
         .set_strict_mode(true);

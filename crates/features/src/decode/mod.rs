@@ -10,7 +10,7 @@ use std::io::Cursor;
 use image::{ImageDecoder, ImageFormat, ImageReader, Limits};
 use serde::{Deserialize, Serialize};
 
-use crate::FeatureError;
+use crate::{FeatureError, GreyImage};
 pub use guess::{CameraSource, guess_camera};
 pub use metadata::{GPano, GeoPosition, ImageMetadata};
 
@@ -65,21 +65,32 @@ impl DecodedImage {
     /// [`FeatureError::NoPixels`] for an empty image and [`FeatureError::SizeMismatch`] if `rgb` is not
     /// `width × height × 3` bytes.
     pub fn from_rgb(width: u32, height: u32, rgb: Vec<u8>) -> Result<Self, FeatureError> {
-        if width == 0 || height == 0 {
-            return Err(FeatureError::NoPixels { width: width.into(), height: height.into() });
-        }
-        if rgb.len() as u64 != u64::from(width) * u64::from(height) * 3 {
-            let rows = rgb.len() as u64 / (u64::from(width) * 3);
-            return Err(FeatureError::SizeMismatch {
-                what: "pixel buffer",
-                expected_width: width,
-                expected_height: height,
-                width,
-                height: u32::try_from(rows).unwrap_or(u32::MAX),
-            });
-        }
+        check_buffer(width, height, rgb.len(), 3)?;
         Ok(Self { width, height, rgb, metadata: ImageMetadata::default() })
     }
+}
+
+/// Checks that there are so many bytes a pixel.
+pub(crate) fn check_buffer(
+    width: u32,
+    height: u32,
+    bytes: usize,
+    per_pixel: u64,
+) -> Result<(), FeatureError> {
+    if width == 0 || height == 0 {
+        return Err(FeatureError::NoPixels { width: width.into(), height: height.into() });
+    }
+    let row = u64::from(width) * per_pixel;
+    if bytes as u64 != row * u64::from(height) {
+        return Err(FeatureError::SizeMismatch {
+            what: "pixel buffer",
+            expected_width: width,
+            expected_height: height,
+            width,
+            height: u32::try_from(bytes as u64 / row).unwrap_or(u32::MAX),
+        });
+    }
+    Ok(())
 }
 
 /// Size and metadata of an image, from its header alone.
@@ -107,8 +118,23 @@ pub fn decode(bytes: &[u8], limits: &DecodeLimits) -> Result<DecodedImage, Featu
         decode_other(bytes, format, limits)?
     };
     let metadata = ImageMetadata::read(bytes);
-    let (width, height, rgb) = orientation::upright(metadata.orientation, width, height, rgb);
+    let (width, height, rgb) = orientation::upright(metadata.orientation, (width, height), rgb, 3);
     Ok(DecodedImage { width, height, rgb, metadata })
+}
+
+/// The same without its colours: of a JPEG only the luma is decoded, where it is stored apart.
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_grey(bytes: &[u8], limits: &DecodeLimits) -> Result<GreyImage, FeatureError> {
+    if format_of(bytes)? == ImageFormat::Jpeg
+        && let Some((width, height, values)) = jpeg::decode_luma(bytes, limits)?
+    {
+        let orientation = ImageMetadata::read(bytes).orientation;
+        let (width, height, values) = orientation::upright(orientation, (width, height), values, 1);
+        return GreyImage::from_values(width, height, values);
+    }
+    Ok(GreyImage::from(&decode(bytes, limits)?))
 }
 
 /// Reads the upright size and the metadata without decoding pixels.

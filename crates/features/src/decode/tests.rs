@@ -201,6 +201,36 @@ fn exif_orientation_turns_the_picture_upright() {
     }
 }
 
+/// How far the grey picture of a file is from that of its colours at most.
+fn most_apart(bytes: &[u8]) -> u8 {
+    let grey = decode_grey(bytes, &limits()).unwrap();
+    let of_colors = GreyImage::from(&decode(bytes, &limits()).unwrap());
+    assert_eq!((grey.width, grey.height), (of_colors.width, of_colors.height));
+    grey.values.iter().zip(&of_colors.values).map(|(a, b)| a.abs_diff(*b)).max().unwrap()
+}
+
+#[test]
+fn grey_pictures_are_those_of_the_colors() {
+    for format in [ImageFormat::Png, ImageFormat::Tiff, ImageFormat::WebP, ImageFormat::Bmp] {
+        assert_eq!(most_apart(&encode(format, 96, 64)), 0, "{format:?}");
+    }
+    let jpeg = encode(ImageFormat::Jpeg, 96, 64);
+    for orientation in 1..=8 {
+        // Colours out of range are cut off, luma is not.
+        let apart = most_apart(&with_app1(&jpeg, &exif(&[(0x112, 3, &[orientation])], &[], &[])));
+        assert!(apart <= 4, "{orientation}: {apart}");
+    }
+    // The channels are said to be red, green and blue: none is luma.
+    let adobe = [&jpeg[..2], b"\xFF\xEE\0\x0EAdobe\0\x64\0\0\0\0\0", &jpeg[2..]].concat();
+    assert_eq!(most_apart(&adobe), 0);
+    let mut grey = Vec::new();
+    let encoder = image::codecs::jpeg::JpegEncoder::new(&mut grey);
+    encoder.write_image(&picture(96, 64)[..96 * 64], 96, 64, ExtendedColorType::L8).unwrap();
+    assert_eq!(most_apart(&grey), 0);
+    let cut = &jpeg[..jpeg.len() - 9];
+    assert_eq!(decode_grey(cut, &limits()).unwrap_err(), decode(cut, &limits()).unwrap_err());
+}
+
 #[test]
 fn exif_focal_length_and_position_are_read() {
     let jpeg = encode(ImageFormat::Jpeg, 96, 64);

@@ -340,7 +340,7 @@ fn window(radius: usize) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::DecodedImage;
+    use crate::GreyImage;
 
     /// A smooth texture without any regularity within a patch.
     fn texture(x: f64, y: f64) -> f64 {
@@ -350,12 +350,10 @@ mod tests {
 
     fn pyramid(size: [u32; 2], wraps: bool, value: impl Fn(f64, f64) -> f64) -> ImagePyramid {
         let pixels = (0..size[1]).flat_map(|y| (0..size[0]).map(move |x| (x, y)));
-        let rgb = pixels
-            .flat_map(|(x, y)| {
-                [value(f64::from(x) + 0.5, f64::from(y) + 0.5).round().clamp(0.0, 255.0) as u8; 3]
-            })
+        let values = pixels
+            .map(|(x, y)| value(f64::from(x) + 0.5, f64::from(y) + 0.5).round().clamp(0.0, 255.0) as u8)
             .collect();
-        ImagePyramid::new(&DecodedImage::from_rgb(size[0], size[1], rgb).unwrap(), wraps)
+        ImagePyramid::new(GreyImage::from_values(size[0], size[1], values).unwrap(), wraps)
     }
 
     fn frame(x: f64, y: f64, step: f64) -> PatchFrame {

@@ -1,5 +1,4 @@
-use crate::DecodedImage;
-use crate::extract::luma;
+use crate::GreyImage;
 use crate::vectorized::{Level as Instructions, vectorized};
 
 /// Most halvings; patches of larger keypoints are not aligned any finer for being taken coarser.
@@ -23,9 +22,9 @@ struct Level {
 
 impl ImagePyramid {
     /// The image and its halvings; `wraps_around` when its left and right ends meet, as a full panorama's do.
-    pub fn new(image: &DecodedImage, wraps_around: bool) -> Self {
-        let values = image.rgb.chunks_exact(3).map(luma).collect();
-        let mut levels = vec![Level { width: image.width as usize, height: image.height as usize, values }];
+    pub fn new(image: GreyImage, wraps_around: bool) -> Self {
+        let GreyImage { width, height, values } = image;
+        let mut levels = vec![Level { width, height, values }];
         while let Some(last) = levels.last() {
             // An odd width would move the seam.
             let closes = !wraps_around || last.width.is_multiple_of(2);
@@ -238,9 +237,9 @@ vectorized! {
 mod tests {
     use super::*;
 
-    fn image(width: u32, height: u32, value: impl Fn(u32, u32) -> u8) -> DecodedImage {
+    fn image(width: u32, height: u32, value: impl Fn(u32, u32) -> u8) -> GreyImage {
         let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
-        DecodedImage::from_rgb(width, height, pixels.flat_map(|(x, y)| [value(x, y); 3]).collect()).unwrap()
+        GreyImage::from_values(width, height, pixels.map(|(x, y)| value(x, y)).collect()).unwrap()
     }
 
     fn value(pyramid: &ImagePyramid, level: usize, x: f32, y: f32) -> Option<f32> {
@@ -256,7 +255,7 @@ mod tests {
 
     #[test]
     fn every_level_has_a_ramp_where_the_image_has_it() {
-        let pyramid = ImagePyramid::new(&image(512, 512, |x, y| (x / 4 + y / 8) as u8), false);
+        let pyramid = ImagePyramid::new(image(512, 512, |x, y| (x / 4 + y / 8) as u8), false);
         for level in 0..3 {
             let (x, y) = (200.0, 304.0);
             let expected = (x - 2.0) / 4.0 + (y - 4.0) / 8.0;
@@ -268,7 +267,7 @@ mod tests {
     #[test]
     fn a_panorama_goes_on_beyond_its_seam() {
         let wave = |x: u32| ((f64::from(x) + 0.5) / 256.0 * std::f64::consts::TAU).cos() * 100.0 + 120.0;
-        let pyramid = ImagePyramid::new(&image(256, 128, |x, _| wave(x).round() as u8), true);
+        let pyramid = ImagePyramid::new(image(256, 128, |x, _| wave(x).round() as u8), true);
         assert_eq!(pyramid.levels.len(), 2);
         for level in 0..2 {
             for x in [-3.0_f32, -0.2, 0.0, 0.3, 255.9, 259.0] {

@@ -2,7 +2,7 @@ use super::Grey;
 use super::blur::{Blur, GROUP};
 use super::extrema::REACH;
 use super::plane::{Kept, Plane, grey};
-use crate::vectorized::Level;
+use crate::vectorized::{Level, vectorized};
 
 /// What an octave is made of.
 #[derive(Debug, Clone, Copy)]
@@ -23,14 +23,14 @@ impl Source<'_> {
         }
     }
 
-    fn put_row(self, y: usize, between: &mut Vec<f32>, target: &mut [f32]) {
+    fn put_row(self, level: Level, y: usize, between: &mut Vec<f32>, target: &mut [f32]) {
         match self {
             Self::Photo(image) => {
                 for (value, &grey) in target.iter_mut().zip(&image.values[y * image.width..]) {
                     *value = f32::from(grey);
                 }
             }
-            Self::Doubled(image) => put_doubled_row(image, y, between, target),
+            Self::Doubled(image) => put_doubled_row(level, rows_about(image, y), between, target),
             Self::Finer(layer) => {
                 for (value, &from) in target.iter_mut().zip(layer.row(2 * y).iter().step_by(2)) {
                     *value = grey(from);
@@ -40,17 +40,31 @@ impl Source<'_> {
     }
 }
 
-fn put_doubled_row(image: Grey<'_>, y: usize, between: &mut Vec<f32>, target: &mut [f32]) {
+/// The two rows of a photo that a row of the doubled one lies between, the nearer one first.
+fn rows_about(image: Grey<'_>, y: usize) -> [&[u8]; 2] {
     let Grey { width, height, values } = image;
     let near = y / 2;
     let far = if y.is_multiple_of(2) { near.saturating_sub(1) } else { (near + 1).min(height - 1) };
-    let (near, far) = (&values[near * width..][..width], &values[far * width..][..width]);
-    between.clear();
-    between.extend(near.iter().zip(far).map(|(&near, &far)| 0.75 * f32::from(near) + 0.25 * f32::from(far)));
-    for x in 0..width {
-        let (left, here, right) = (between[x.saturating_sub(1)], between[x], between[(x + 1).min(width - 1)]);
-        target[2 * x] = 0.25 * left + 0.75 * here;
-        target[2 * x + 1] = 0.75 * here + 0.25 * right;
+    [near, far].map(|row| &values[row * width..][..width])
+}
+
+vectorized! {
+    fn put_doubled_row(rows: [&[u8]; 2], between: &mut Vec<f32>, target: &mut [f32]) {
+        let [near, far] = rows;
+        between.clear();
+        let along = near.iter().zip(far);
+        between.extend(along.map(|(&near, &far)| 0.75 * f32::from(near) + 0.25 * f32::from(far)));
+        let inner = between.windows(3).zip(target[2..].chunks_exact_mut(2));
+        for (from, to) in inner {
+            to[0] = 0.25 * from[0] + 0.75 * from[1];
+            to[1] = 0.75 * from[1] + 0.25 * from[2];
+        }
+        let last = between.len() - 1;
+        for x in [0, last] {
+            let (left, here, right) = (between[x.saturating_sub(1)], between[x], between[(x + 1).min(last)]);
+            target[2 * x] = 0.25 * left + 0.75 * here;
+            target[2 * x + 1] = 0.75 * here + 0.25 * right;
+        }
     }
 }
 
@@ -113,7 +127,7 @@ impl Octave {
             put = rows.end;
             let input = if first.is_some() { &mut self.input } else { &mut self.layers[0] };
             for y in rows {
-                source.put_row(y, &mut self.between, input.row_mut(y));
+                source.put_row(level, y, &mut self.between, input.row_mut(y));
             }
             written = match &mut first {
                 Some(blur) => blur.advance(level, &self.input, put, &mut self.layers[0]),
@@ -141,10 +155,20 @@ mod tests {
     #[test]
     fn doubling_keeps_a_ramp() {
         let values: Vec<u8> = (0..15).map(|at| 10 + 20 * (at % 5)).collect();
-        let mut row = [0.0; 10];
         let source = Source::Doubled(Grey { width: 5, height: 3, values: &values });
-        source.put_row(3, &mut Vec::new(), &mut row);
-        assert_eq!(row[1..9], [15.0, 25.0, 35.0, 45.0, 55.0, 65.0, 75.0, 85.0]);
+        for level in [Level::Baseline, Level::detect()] {
+            let mut row = [0.0; 10];
+            source.put_row(level, 3, &mut Vec::new(), &mut row);
+            assert_eq!(row, [10.0, 15.0, 25.0, 35.0, 45.0, 55.0, 65.0, 75.0, 85.0, 90.0]);
+        }
+        let mut row = [0.0; 2];
+        Source::Doubled(Grey { width: 1, height: 2, values: &[4, 8] }).put_row(
+            Level::detect(),
+            1,
+            &mut Vec::new(),
+            &mut row,
+        );
+        assert_eq!(row, [5.0; 2]);
     }
 
     #[test]
@@ -162,7 +186,7 @@ mod tests {
         let mut photo = Plane::default();
         photo.resize(width, height);
         for y in 0..height {
-            Source::Photo(image).put_row(y, &mut Vec::new(), photo.row_mut(y));
+            Source::Photo(image).put_row(Level::Baseline, y, &mut Vec::new(), photo.row_mut(y));
         }
         let mut expected = vec![whole(&photo, sigmas.first)];
         for &sigma in &sigmas.steps {

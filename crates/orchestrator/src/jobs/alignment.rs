@@ -114,8 +114,8 @@ impl Pyramids {
             return Ok(Arc::clone(found));
         }
         let bytes = read_unchanged(path, hash)?;
-        let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
-        let pyramid = Arc::new(stages::ImagePyramid::new(&decoded, wraps));
+        let grey = stages::decode_grey(&bytes, &stages::DecodeLimits::default())?;
+        let pyramid = Arc::new(stages::ImagePyramid::new(grey, wraps));
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         if kept.0 + pyramid.byte_size() <= KEPT_BYTES {
             kept.0 += pyramid.byte_size();
