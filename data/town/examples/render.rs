@@ -19,7 +19,8 @@ fn main() -> ExitCode {
 
 fn run() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args_os().skip(1).map(PathBuf::from);
-    let out = arguments.next().ok_or("usage: render OUT [PARAMS.json]")?;
+    let is_folder = |out: &PathBuf| !out.to_string_lossy().starts_with('-');
+    let out = arguments.next().filter(is_folder).ok_or("usage: render OUT [PARAMS.json]")?;
     let params = match arguments.next() {
         Some(path) => serde_json::from_str(&std::fs::read_to_string(path)?)?,
         None => TownParams::default(),

@@ -59,7 +59,7 @@ pub(super) fn divide<'a>(
     let mut divided = given.clone();
     let mut doubtful = Vec::new();
     for (camera, guess) in given.cameras.iter().enumerate() {
-        let is_of_camera = |image: &ImageId| given.images[image.index()].camera.index() == camera;
+        let is_of_camera = |image: &ImageId| given.camera_index(*image) == camera;
         let images: Vec<ImageId> = component.registered().filter(is_of_camera).collect();
         let is_known = given.calibrations[camera] == Calibration::Known;
         if is_known || guess.is_panoramic() || images.len() < MIN_IMAGES {
@@ -90,7 +90,7 @@ pub(super) fn divide<'a>(
 /// Gives images one further camera, begun with the one that they have.
 fn give_camera(input: &mut MapperInput<'_>, images: &[ImageId]) {
     let Some(first) = images.first() else { return };
-    let before = input.images[first.index()].camera.index();
+    let before = input.camera_index(*first);
     let camera = CameraId(input.cameras.len() as u32);
     input.cameras.push(input.cameras[before].clone());
     input.calibrations.push(Calibration::Guessed);
@@ -213,7 +213,7 @@ impl Trial<'_, '_> {
         };
         let image_fit = |&image: &ImageId| ImageFit {
             cost: cost_about(image),
-            focal: model.cameras[input.images[image.index()].camera.index()].focal_length(),
+            focal: model.cameras[input.camera_index(image)].focal_length(),
             is_told: tells_camera(&model, &[image]),
         };
         let images = self.images.iter().map(image_fit).collect();

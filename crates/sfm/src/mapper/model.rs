@@ -92,7 +92,7 @@ impl<'a> Model<'a> {
     ) -> Self {
         let mut cameras = moved.cameras.clone();
         for image in kept.registered() {
-            let camera = input.images[image.index()].camera.index();
+            let camera = input.camera_index(image);
             cameras[camera] = kept.cameras[camera].clone();
         }
         let mut model = Self::with_cameras(input, cameras, |image| !taken[image]);
@@ -167,7 +167,7 @@ impl<'a> Model<'a> {
 
     /// The registered images of a camera, by its index.
     pub fn registered_with(&self, camera: usize) -> Vec<ImageId> {
-        self.registered().filter(|image| self.input.images[image.index()].camera.index() == camera).collect()
+        self.registered().filter(|image| self.input.camera_index(*image) == camera).collect()
     }
 
     pub fn registered_count(&self) -> usize {

@@ -257,10 +257,7 @@ impl<'a> Underfoot<'a> {
                     !self.is_near(poles, first, m.first) && !self.is_near(poles, second, m.second)
                 });
                 let seed = seed.wrapping_add(at as u64);
-                let posture = Posture::of(
-                    [first, second]
-                        .map(|image| &self.input.cameras[self.input.images[image.index()].camera.index()]),
-                );
+                let posture = Posture::of([first, second].map(|image| self.input.camera_of(image)));
                 let geometries = both(&self.rays, first, second)
                     .map(|[a, b]| verify_pair(&self.input.two_view, posture, a, b, &left.matches, seed));
                 let pair = |two_view| PairGeometry { first, second, two_view };

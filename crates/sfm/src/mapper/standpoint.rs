@@ -176,7 +176,7 @@ impl<'a> Standpoints<'a> {
         let images = &self.original.images;
         let mut mosaic = Mosaic { members: Vec::new(), origin: Vec::new() };
         for &(image, image_from_mosaic) in members {
-            let camera = self.original.cameras[images[image.index()].camera.index()].clone();
+            let camera = self.original.camera_of(image).clone();
             mosaic.members.push(Member { image, image_from_mosaic, camera });
         }
         let first = images[members[0].0.index()];
@@ -331,7 +331,7 @@ fn candidate_turns<'a>(params: &MapperParams, input: &MapperInput<'a>) -> Vec<&'
         .iter()
         .filter(|pair| {
             let known = |image: ImageId| {
-                let camera = input.images[image.index()].camera.index();
+                let camera = input.camera_index(image);
                 input.is_fixed(camera) && !input.is_panoramic(image)
             };
             pair.two_view.kind == TwoViewKind::PureRotation

@@ -36,8 +36,7 @@ pub(super) fn correct_told<'a>(
     let mut corrected = used.clone();
     let mut is_contradicted = false;
     for camera in 0..told.cameras.len() {
-        let images =
-            component.registered().filter(|image| used.images[image.index()].camera.index() == camera);
+        let images = component.registered().filter(|image| used.camera_index(*image) == camera);
         let is_told = used.calibrations[camera] == Calibration::Known && !used.cameras[camera].is_panoramic();
         if !is_told || images.count() < MIN_IMAGES {
             continue;

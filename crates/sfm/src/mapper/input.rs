@@ -1,0 +1,79 @@
+//! What the mapper works on.
+
+use nalgebra::Vector3;
+use setloc_features::{Calibration, Camera, ImageFeatures, Match};
+
+use super::Mosaic;
+use crate::{CameraId, ImageId, PairGeometry, TwoViewParams};
+
+/// One image to map.
+#[derive(Debug, Clone, Copy)]
+pub struct InputImage<'a> {
+    /// Name as the user knows it.
+    pub name: &'a str,
+    /// Index into [`MapperInput::cameras`].
+    pub camera: CameraId,
+    /// Its features.
+    pub features: &'a ImageFeatures,
+    /// Measured centre in local east-north-up metres, when GPS is given.
+    pub position_prior: Option<Vector3<f64>>,
+    /// What it covers, when it is a mosaic of photos from one standpoint; `None` for plain images.
+    pub mosaic: Option<&'a Mosaic>,
+}
+
+impl<'a> InputImage<'a> {
+    /// A plain image whose centre was not measured.
+    pub fn new(name: &'a str, camera: CameraId, features: &'a ImageFeatures) -> Self {
+        Self { name, camera, features, position_prior: None, mosaic: None }
+    }
+}
+
+/// What the mapper works on.
+#[derive(Debug, Clone)]
+pub struct MapperInput<'a> {
+    /// Cameras, shared by images.
+    pub cameras: Vec<Camera>,
+    /// How well each camera is known; all but guesses stay fixed.
+    pub calibrations: Vec<Calibration>,
+    /// All images; ids are indices.
+    pub images: Vec<InputImage<'a>>,
+    /// Verified pairs.
+    pub pairs: &'a [PairGeometry],
+    /// All matches of the pairs, also those that no geometry explains; pairs left out count with their inliers.
+    pub putative: &'a [PutativePair],
+    /// How pairs of mosaics are verified.
+    pub two_view: TwoViewParams,
+}
+
+impl MapperInput<'_> {
+    /// Whether the intrinsics of a camera stay as they are.
+    pub(crate) fn is_fixed(&self, camera: usize) -> bool {
+        self.calibrations[camera].is_settled()
+    }
+
+    /// The index of an image's camera.
+    pub(crate) fn camera_index(&self, image: ImageId) -> usize {
+        self.images[image.index()].camera.index()
+    }
+
+    /// The camera of an image.
+    pub(crate) fn camera_of(&self, image: ImageId) -> &Camera {
+        &self.cameras[self.camera_index(image)]
+    }
+
+    /// Whether an image is a panorama.
+    pub(crate) fn is_panoramic(&self, image: ImageId) -> bool {
+        self.camera_of(image).is_panoramic()
+    }
+}
+
+/// All matches of two images, before verification.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PutativePair {
+    /// First image.
+    pub first: ImageId,
+    /// Second image.
+    pub second: ImageId,
+    /// Its matches.
+    pub matches: Vec<Match>,
+}

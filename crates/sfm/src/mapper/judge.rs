@@ -1,0 +1,280 @@
+//! Which pose of an image is taken, if any.
+
+use super::{
+    Mapper, RegistrationRecord,
+    depths::stands_on_floor,
+    latecomers::{hypothesize_from_crossings, hypothesize_from_depths},
+    neighbours::{Neighbours, neighbours, share_as_neighbours, share_with_one},
+    register::{PoseHypothesis, hypothesize, hypothesize_from_pairs},
+    support::{Support, Worth},
+    witnesses::{Testimony, count_agreeing},
+};
+use crate::{ImageId, PointId, Rigid, robust::RansacParams};
+
+/// Share of a pair's matches on the epipolar circles of a pose that make it agree with that pose.
+const MIN_ON_CIRCLES: f64 = 0.9;
+
+impl Mapper<'_> {
+    /// A pose that may be taken, and what was thought of it and those before.
+    pub(super) fn acceptable_pose(
+        &self,
+        image: ImageId,
+    ) -> (Option<PoseHypothesis>, Vec<RegistrationRecord>) {
+        let mut records = Vec::new();
+        let mut has_rival = false;
+        let seed = self.seed ^ (u64::from(image.0) << 32);
+        let ransac = self.params.ransac();
+        let resected =
+            hypothesize(&self.model, &self.graph, image, &ransac, self.params.max_pose_hypotheses, seed);
+        let pose = self.first_accepted(image, resected, &mut has_rival, &mut records).or_else(|| {
+            let confirmed = RansacParams { min_inliers: self.params.min_confirmed_inliers, ..ransac };
+            let mut from_pairs = hypothesize_from_pairs(&self.model, &self.graph, image, &confirmed);
+            from_pairs.retain(|pose| {
+                pose.inliers.len() as f64 >= self.params.min_confirmed_share * pose.candidates as f64
+                    || pose.inliers.len() >= self.params.min_registration_inliers
+            });
+            from_pairs.truncate(self.params.max_pose_hypotheses);
+            self.first_accepted(image, from_pairs, &mut has_rival, &mut records)
+        });
+        let pose = pose.or_else(|| {
+            let crossed = (self.admits_latecomers).then(|| {
+                let sigmas = self.params.max_error_sigma;
+                hypothesize_from_crossings(&self.model, &self.graph, &self.taken, image, sigmas)
+            })?;
+            // Two directions nearly always cross somewhere.
+            let pose = crossed.filter(|pose| self.is_latecomer(image, &pose.world_from_camera))?;
+            self.first_accepted(image, vec![pose], &mut has_rival, &mut records)
+        });
+        let pose = pose.or_else(|| {
+            let hung = self.admits_by_depths.then(|| {
+                let sigmas = self.params.max_error_sigma;
+                hypothesize_from_depths(&self.model, &self.graph, &self.taken, image, sigmas)
+            })?;
+            let pose = hung.filter(|pose| self.may_hang(image, &pose.world_from_camera))?;
+            self.first_accepted(image, vec![pose], &mut has_rival, &mut records)
+        });
+        (pose, records)
+    }
+
+    /// The first of these that may be taken; `has_rival` tells whether pairs clearly spoke for one that was refused.
+    pub(super) fn first_accepted(
+        &self,
+        image: ImageId,
+        hypotheses: Vec<PoseHypothesis>,
+        has_rival: &mut bool,
+        records: &mut Vec<RegistrationRecord>,
+    ) -> Option<PoseHypothesis> {
+        let mut refused_before = false;
+        for hypothesis in hypotheses {
+            let seen = hypothesis.visibility;
+            let judged = seen.expected >= self.params.min_visible_points;
+            // Where a better supported pose was refused for what it does not see, this one needs evidence of its own.
+            let testimony = self.testimony(image, &hypothesis.world_from_camera, &hypothesis.inliers);
+            let plausible = match testimony {
+                Some(testimony) => testimony.speaks_for(),
+                None if judged => self.params.is_recognized(&seen),
+                None => !refused_before,
+            };
+            let plausible = plausible
+                || hypothesis.length.is_some() && self.may_hang(image, &hypothesis.world_from_camera)
+                || self.is_latecomer(image, &hypothesis.world_from_camera);
+            refused_before |= !plausible;
+            let is_contradicted = self.model.input.is_panoramic(image) && {
+                let support = self.support(image, &hypothesis.world_from_camera);
+                let is_contradicted =
+                    support.is_untenable() || (*has_rival || !judged) && support.is_contradicted();
+                *has_rival |= support.is_clear();
+                is_contradicted
+            };
+            let accepted = plausible
+                && !is_contradicted
+                && self.pair_agreement(image, &hypothesis.world_from_camera)
+                    >= self.params.min_pair_agreement;
+            let (candidates, inliers) = (hypothesis.candidates, hypothesis.inliers.len());
+            records.push(RegistrationRecord::new(image, accepted, [candidates, inliers], &seen));
+            if accepted {
+                return Some(hypothesis);
+            }
+        }
+        None
+    }
+
+    /// What those say that judge poses in place of what is in plain view; `None` where nobody does.
+    pub(super) fn testimony(
+        &self,
+        image: ImageId,
+        world_from_camera: &Rigid,
+        inliers: &[(u32, PointId)],
+    ) -> Option<Testimony> {
+        let witnesses = self.witnesses?;
+        Some(witnesses.hear(&self.model, image, world_from_camera, inliers, self.params.max_error_sigma))
+    }
+
+    /// What the verified pairs of an image say of a pose.
+    fn support(&self, image: ImageId, world_from_camera: &Rigid) -> Support {
+        Support::of(&self.model, &self.taken, image, world_from_camera, self.params.max_error_sigma)
+    }
+
+    /// Whether an image may come in late at a pose.
+    pub(super) fn is_latecomer(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        if !self.admits_latecomers {
+            return false;
+        }
+        let support = self.support(image, world_from_camera);
+        let is_believed = || Worth::of(&[&self.model], self.params.max_error_sigma).believes(support.widest);
+        support.is_enough(self.params.min_initial_points)
+            && (support.is_strong() && is_believed() || self.shares_with_one(image, world_from_camera))
+    }
+
+    /// Whether an image may hang at a pose by one pair whose length depths tell.
+    fn may_hang(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        if !self.admits_by_depths {
+            return false;
+        }
+        let sigmas = self.params.max_error_sigma;
+        let support = self.support(image, world_from_camera);
+        let is_at_home = || {
+            support.is_strong()
+                || self.shares_with_one(image, world_from_camera)
+                || stands_on_floor(&self.model, image, world_from_camera, sigmas)
+        };
+        support.is_enough_if_right()
+            && Worth::of(&[&self.model], sigmas).believes(support.widest)
+            && is_at_home()
+    }
+
+    /// Whether a registered image hangs so.
+    pub(super) fn hangs(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        self.model.lengths.iter().any(|length| length.to == image) && self.may_hang(image, world_from_camera)
+    }
+
+    fn shares_with_one(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        let (known, asked) = self.neighbours_of(image, world_from_camera);
+        share_with_one(&known, &asked)
+    }
+
+    /// Whether an image shares with those next to a pose what neighbours do, by what these share with theirs.
+    pub(super) fn shares_as_neighbour(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        let (known, asked) = self.neighbours_of(image, world_from_camera);
+        share_as_neighbours(&known, &asked)
+    }
+
+    /// The pairs of those next to a pose, and what an image there shares with them.
+    fn neighbours_of(&self, image: ImageId, world_from_camera: &Rigid) -> (Vec<Neighbours>, Vec<Neighbours>) {
+        let model = &self.model;
+        let mut is_near = vec![false; model.poses.len()];
+        for other in model.registered_neighbours(image) {
+            is_near[other.index()] = true;
+        }
+        let placed = |of: ImageId| {
+            let pose = if of == image {
+                *world_from_camera
+            } else {
+                model.poses[of.index()].as_ref()?.world_from_camera
+            };
+            Some((pose, &model.rays[of.index()]))
+        };
+        let counts = |first: ImageId, second: ImageId| is_near[first.index()] || is_near[second.index()];
+        let pairs = neighbours(model.input, placed, counts, self.params.max_error_sigma);
+        pairs.into_iter().partition(|pair| !pair.images.contains(&image))
+    }
+
+    /// Share of an image's verified matches to registered images that belong to pairs that agree with a pose.
+    ///
+    /// Resection from a few points in one corner, or on one plane, can settle on a pose far from the true one; the
+    /// essential matrices of the same image rarely share that error. Those of a camera that was found since have another
+    /// error, and are not asked. A pair agrees by its rotation, or by its matches: those of one wall fit two rotations, of
+    /// which verification takes either.
+    fn pair_agreement(&self, image: ImageId, world_from_camera: &Rigid) -> f64 {
+        if self.recalibrated[self.model.input.camera_index(image)] {
+            return 1.0;
+        }
+        let (mut agreeing, mut all) = (0, 0);
+        for pair in self.model.input.pairs {
+            let Some((other, measured)) = pair.seen_from(image) else { continue };
+            let Some(pose) = &self.model.poses[other.index()] else { continue };
+            let image_from_other = world_from_camera.inverse() * pose.world_from_camera;
+            let matches = pair.two_view.inliers.len();
+            all += matches;
+            let deviation = image_from_other.rotation.angle_to(&measured.rotation);
+            let agrees = deviation.to_degrees() <= self.params.max_pair_rotation_deg || {
+                let sigmas = self.params.max_error_sigma;
+                let on_circles = count_agreeing(&self.model, pair, image, &image_from_other, sigmas);
+                on_circles as f64 >= MIN_ON_CIRCLES * matches as f64
+            };
+            if agrees {
+                agreeing += matches;
+            }
+        }
+        if all == 0 { 1.0 } else { agreeing as f64 / all as f64 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{UnitQuaternion, Vector3};
+    use rand::Rng;
+    use setloc_features::{Calibration, Camera, ImageFeatures, Keypoint, Match};
+
+    use super::*;
+    use crate::mapper::{InputImage, MapperInput, MapperParams, Model, wall};
+    use crate::{CameraId, PairGeometry, TwoView, TwoViewKind, TwoViewParams, synthetic::seeded};
+
+    /// Points of one wall fit two rotations, and verification may have taken the other one.
+    #[test]
+    fn a_pair_that_sees_one_wall_agrees_with_either_pose_that_the_wall_leaves() {
+        let mut rng = seeded("one wall");
+        let camera = Camera::equirectangular(4096, 2048);
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.4);
+        let poses = [Rigid::identity(), Rigid::new(turn, Vector3::new(2.0, 0.1, 1.0))];
+        let wall: Vec<Vector3<f64>> = (0..120)
+            .map(|_| Vector3::new(rng.random_range(-4.0..4.0), rng.random_range(-3.0..3.0), 6.0))
+            .collect();
+        let features = poses.map(|pose| {
+            let mut features = ImageFeatures { width: 4096, height: 2048, ..ImageFeatures::default() };
+            for point in &wall {
+                let pixel = camera.project(&pose.inverse_transform_point(point)).expect("sees all around");
+                let (x, y) = (pixel.x as f32, pixel.y as f32);
+                features.keypoints.push(Keypoint { x, y, size: 4.0, orientation: 0.0, noise_px: 0.3 });
+                features.colors.push([128; 3]);
+            }
+            features
+        });
+        let rays = features.each_ref().map(|features| features.rays(&camera));
+        let bearings = wall::Bearings {
+            first: &rays[0].bearings,
+            second: &rays[1].bearings,
+            sigmas_first: &rays[0].sigmas,
+            sigmas_second: &rays[1].sigmas,
+        };
+        let truth = poses[1].inverse() * poses[0];
+        let steps = wall::steps_by_wall(&bearings, 1).into_iter();
+        let both: Vec<Rigid> = steps.map(|(step, _)| step.first_from_second.inverse()).collect();
+        let off_by = |pose: &Rigid| pose.rotation.angle_to(&truth.rotation).to_degrees();
+        let other = both.iter().find(|pose| off_by(pose) > 10.0).expect("the wall leaves another pose");
+        let two_view = TwoView {
+            kind: TwoViewKind::General,
+            second_from_first: *other,
+            inliers: (0..120).map(|at| Match { first: at, second: at }).collect(),
+            median_parallax_rad: 0.3,
+        };
+        let pairs = [PairGeometry { first: ImageId(0), second: ImageId(1), two_view }];
+        let input = MapperInput {
+            cameras: vec![camera.clone()],
+            calibrations: vec![Calibration::Known],
+            images: features.iter().map(|features| InputImage::new("photo", CameraId(0), features)).collect(),
+            pairs: &pairs,
+            putative: &[],
+            two_view: TwoViewParams::default(),
+        };
+        let mut model = Model::new(&input);
+        model.set_pose(ImageId(0), Some(poses[0]));
+        let params = MapperParams::default();
+        let mapper = Mapper::over(&params, model, vec![false; 2], 0);
+        assert_eq!(mapper.pair_agreement(ImageId(1), &poses[1]), 1.0);
+        assert_eq!(mapper.pair_agreement(ImageId(1), &other.inverse()), 1.0);
+        let askew = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.2);
+        let askew = Rigid::new(askew * poses[1].rotation, poses[1].translation);
+        assert_eq!(mapper.pair_agreement(ImageId(1), &askew), 0.0);
+    }
+}
