@@ -212,3 +212,25 @@ pub(super) fn match_parts(
     matches.sort_unstable();
     matches
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_are_by_group_then_extent_to_and_fro_then_index() {
+        let extents = [-3.5, -0.25, 0.0, 1.0e-3, 2.0];
+        let along = |group: Group| {
+            let mut extents = extents;
+            if group % 2 == 1 {
+                extents.reverse();
+            }
+            extents.map(|extent| Aspect { group, extent })
+        };
+        let sorted = [0, 1, 7, NUM_GROUPS - 1].into_iter().flat_map(along);
+        let places: Vec<u64> =
+            sorted.flat_map(|aspect| [3, 1 << 20].map(|index| aspect.place(index))).collect();
+        assert!(places.is_sorted_by(|a, b| a < b));
+        assert_eq!(places.last().map(|place| place & INDEX_MASK), Some(1 << 20));
+    }
+}
