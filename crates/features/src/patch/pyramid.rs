@@ -1,5 +1,5 @@
 use crate::GreyImage;
-use crate::vectorized::{Level as Instructions, vectorized};
+use crate::vectorized::{Level, vectorized};
 
 /// Most halvings; patches of larger keypoints are not aligned any finer for being taken coarser.
 const MAX_LEVELS: usize = 6;
@@ -9,22 +9,14 @@ const MIN_SIDE: usize = 64;
 /// A grey image with ever smaller copies of it, to sample patches of any scale from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImagePyramid {
-    levels: Vec<Level>,
+    levels: Vec<GreyImage>,
     wraps_around: bool,
-}
-
-#[derive(Debug, Clone, PartialEq)]
-struct Level {
-    width: usize,
-    height: usize,
-    values: Vec<u8>,
 }
 
 impl ImagePyramid {
     /// The image and its halvings; `wraps_around` when its left and right ends meet, as a full panorama's do.
     pub fn new(image: GreyImage, wraps_around: bool) -> Self {
-        let GreyImage { width, height, values } = image;
-        let mut levels = vec![Level { width, height, values }];
+        let mut levels = vec![image];
         while let Some(last) = levels.last() {
             // An odd width would move the seam.
             let closes = !wraps_around || last.width.is_multiple_of(2);
@@ -84,7 +76,7 @@ impl ImagePyramid {
             }));
         }
         offsets.resize(columns.len(), 0);
-        split(Instructions::detect(), columns, rows, width as i32, offsets);
+        split(Level::detect(), columns, rows, width as i32, offsets);
         if inside {
             let first = origin[1] * width + origin[0];
             corners.extend(offsets.iter().map(|&offset| {
@@ -93,7 +85,7 @@ impl ImagePyramid {
             }));
         }
         values.resize(corners.len(), 0.0);
-        interpolate(Instructions::detect(), corners, columns, rows, values);
+        interpolate(Level::detect(), corners, columns, rows, values);
         true
     }
 }
@@ -155,8 +147,8 @@ pub(super) struct Samples {
     pub values: Vec<f32>,
 }
 
-impl Level {
-    /// The pixels `upper` and those below them.
+impl GreyImage {
+    /// Two pixels of a row, by their places among all, and those below them.
     #[inline]
     fn corners(&self, [left, right]: [usize; 2]) -> [u8; 4] {
         let values = &self.values;
@@ -175,11 +167,11 @@ impl Level {
                 &self.values[y * self.width..(y + 1) * self.width]
             };
             let inner = &mut sums[1..=self.width];
-            add_rows(Instructions::detect(), [row(-1), row(0), row(1), row(2)], inner);
+            add_rows(Level::detect(), [row(-1), row(0), row(1), row(2)], inner);
             let ends = [inner[0], inner[self.width - 1]];
             let [before, after] = if wraps_around { [ends[1], ends[0]] } else { ends };
             (sums[0], sums[self.width + 1]) = (before, after);
-            halve_row(Instructions::detect(), &sums, target);
+            halve_row(Level::detect(), &sums, target);
         }
         Self { width, height, values }
     }

@@ -50,8 +50,8 @@ pub fn estimate_relative_pose(
     sigmas_second: &[f64],
     seed: u64,
 ) -> Option<RelativePoseEstimate> {
-    let mut problem = RelativeConsensus::new(params, first, second, sigmas_first, sigmas_second)?;
-    Some(lo_ransac(params, &mut problem, seed)?.into())
+    let matches = RelativeMatches::new(params, first, second, sigmas_first, sigmas_second)?;
+    Some(lo_ransac(params, &mut Sampled { matches: &matches, sampler: Five }, seed)?.into())
 }
 
 /// [`estimate_relative_pose`] where the y axes of both views are vertical to a few degrees: `upright` samples of three, scored with
@@ -69,11 +69,10 @@ pub(crate) fn estimate_level_pose(
     sigmas_second: &[f64],
     seed: u64,
 ) -> Option<RelativePoseEstimate> {
-    let data = RelativeConsensus::new(params, first, second, sigmas_first, sigmas_second)?;
-    let mut problem = UprightConsensus { data };
+    let matches = &RelativeMatches::new(params, first, second, sigmas_first, sigmas_second)?;
     let begun = RansacParams { max_iterations: upright, ..params.clone() };
-    let start = lo_ransac(&begun, &mut problem, seed).map(|found| found.model);
-    Some(lo_ransac_from(start, params, &mut problem.data, seed)?.into())
+    let start = lo_ransac(&begun, &mut Sampled { matches, sampler: Upright }, seed).map(|found| found.model);
+    Some(lo_ransac_from(start, params, &mut Sampled { matches, sampler: Five }, seed)?.into())
 }
 
 /// [`estimate_relative_pose`] where the rotation is known to a few degrees: two-point LO-RANSAC of the direction of the
@@ -87,10 +86,9 @@ pub(crate) fn estimate_turned_pose(
     second_from_first: &UnitQuaternion<f64>,
     seed: u64,
 ) -> Option<RelativePoseEstimate> {
-    let data = RelativeConsensus::new(params, first, second, sigmas_first, sigmas_second)?;
-    let rotation = second_from_first.to_rotation_matrix().into_inner();
-    let found = lo_ransac(params, &mut TurnedConsensus { data, rotation }, seed)?;
-    Some(found.into())
+    let matches = RelativeMatches::new(params, first, second, sigmas_first, sigmas_second)?;
+    let sampler = Turned { rotation: second_from_first.to_rotation_matrix().into_inner() };
+    Some(lo_ransac(params, &mut Sampled { matches: &matches, sampler }, seed)?.into())
 }
 
 /// Refines a relative pose by Levenberg–Marquardt with a Cauchy loss on the given pairs (all indices must be valid).
@@ -103,14 +101,14 @@ pub fn refine_relative_pose(
     inliers: &[u32],
     initial: &Rigid,
 ) -> Rigid {
-    let Some(problem) = RelativeConsensus::new(params, first, second, sigmas_first, sigmas_second) else {
+    let Some(matches) = RelativeMatches::new(params, first, second, sigmas_first, sigmas_second) else {
         return *initial;
     };
     let Some(translation) = initial.translation.try_normalize(0.0) else {
         return *initial;
     };
     let rotation = initial.rotation.to_rotation_matrix().into_inner();
-    let refined = problem.refine(&SecondFromFirst { rotation, translation }, inliers, 30);
+    let refined = matches.refine(&SecondFromFirst { rotation, translation }, inliers, 30);
     Rigid::from_matrix(&refined.rotation, refined.translation)
 }
 
@@ -126,7 +124,7 @@ pub fn estimate_rotation(
     seed: u64,
 ) -> Option<RotationEstimate> {
     let mut problem =
-        RotationConsensus(RelativeConsensus::new(params, first, second, sigmas_first, sigmas_second)?);
+        RotationConsensus(RelativeMatches::new(params, first, second, sigmas_first, sigmas_second)?);
     let found = lo_ransac(params, &mut problem, seed)?;
     Some(RotationEstimate {
         second_from_first: Rigid::from_matrix(&found.model, Vector3::zeros()).rotation,
@@ -156,14 +154,14 @@ impl From<Consented<SecondFromFirst>> for RelativePoseEstimate {
     }
 }
 
-struct RelativeConsensus<'a> {
+struct RelativeMatches<'a> {
     first: &'a [Vector3<f64>],
     second: &'a [Vector3<f64>],
     variances: Vec<(f64, f64)>,
     inverse_scale_squared: f64,
 }
 
-impl<'a> RelativeConsensus<'a> {
+impl<'a> RelativeMatches<'a> {
     fn new(
         params: &RansacParams,
         first: &'a [Vector3<f64>],
@@ -181,6 +179,12 @@ impl<'a> RelativeConsensus<'a> {
             variances: sigmas_first.iter().zip(sigmas_second).map(|(a, b)| (a * a, b * b)).collect(),
             inverse_scale_squared: cauchy_scale(params),
         })
+    }
+
+    /// The bearings of some matches, drawn at random.
+    fn sample<const N: usize>(&self, rng: &mut ChaCha8Rng) -> ([Vector3<f64>; N], [Vector3<f64>; N]) {
+        let sample = distinct::<N>(rng, self.first.len());
+        (sample.map(|i| self.first[i]), sample.map(|i| self.second[i]))
     }
 
     /// Sampson residual and, on request, its derivative over (δω, δt) with R ← exp(δω)·R, t ← t + δt (3 + 3).
@@ -201,39 +205,8 @@ impl<'a> RelativeConsensus<'a> {
         let variance = variance.max(1e-12 * (variance_first + variance_second));
         Sampson { rotated, error, variance, along_second, along_first }
     }
-}
 
-struct Sampson {
-    rotated: Vector3<f64>,
-    error: f64,
-    variance: f64,
-    along_second: f64,
-    along_first: f64,
-}
-
-impl Consensus for RelativeConsensus<'_> {
-    type Model = SecondFromFirst;
-
-    fn len(&self) -> usize {
-        self.first.len()
-    }
-
-    fn sample_size(&self) -> usize {
-        5
-    }
-
-    fn hypothesize(&mut self, rng: &mut ChaCha8Rng, models: &mut Vec<SecondFromFirst>) {
-        let sample = distinct::<5>(rng, self.len());
-        let (first, second) = (sample.map(|i| self.first[i]), sample.map(|i| self.second[i]));
-        for essential in &five_point(&first, &second) {
-            for (rotation, translation) in &rotations_of_essential(essential) {
-                if first.iter().zip(&second).all(|(a, b)| is_in_front(&(rotation * a), translation, b)) {
-                    models.push(SecondFromFirst { rotation: *rotation, translation: *translation });
-                }
-            }
-        }
-    }
-
+    /// [`Consensus::squared_residual`].
     #[inline(always)]
     fn squared_residual(&self, model: &SecondFromFirst, index: usize, bound: f64) -> f64 {
         let term = self.sampson(model, index);
@@ -252,13 +225,22 @@ impl Consensus for RelativeConsensus<'_> {
         squared
     }
 
+    /// [`Consensus::refine`].
     fn refine(&self, model: &SecondFromFirst, inliers: &[u32], max_steps: usize) -> SecondFromFirst {
         minimize::<5, _>(&RelativeFit { data: self, inliers }, *model, max_steps)
     }
 }
 
+struct Sampson {
+    rotated: Vector3<f64>,
+    error: f64,
+    variance: f64,
+    along_second: f64,
+    along_first: f64,
+}
+
 struct RelativeFit<'a> {
-    data: &'a RelativeConsensus<'a>,
+    data: &'a RelativeMatches<'a>,
     inliers: &'a [u32],
 }
 
@@ -322,90 +304,130 @@ fn sampson_derivative(
     ((error_turn - variance_turn * ratio) * inverse, (error_shift - variance_shift * ratio) * inverse)
 }
 
-/// How many times the bound a match may be off a pose that takes both views for upright.
-///
-/// Tilted against each other by some degrees, they still have most of their matches within it.
-const TILT_SLACK: f64 = 3.0;
+/// Poses of samples of matches, by a minimal solver.
+trait Sampler {
+    /// Matches in a sample.
+    const SIZE: usize;
+    /// How many times the bound a match may be off such a pose.
+    const SLACK: f64 = 1.0;
 
-struct UprightConsensus<'a> {
-    data: RelativeConsensus<'a>,
+    /// Draws a sample and appends its poses.
+    fn hypothesize(
+        &self,
+        matches: &RelativeMatches<'_>,
+        rng: &mut ChaCha8Rng,
+        models: &mut Vec<SecondFromFirst>,
+    );
 }
 
-impl Consensus for UprightConsensus<'_> {
+/// Relative poses by samples of one kind.
+struct Sampled<'m, 'a, S> {
+    matches: &'m RelativeMatches<'a>,
+    sampler: S,
+}
+
+impl<S: Sampler> Consensus for Sampled<'_, '_, S> {
     type Model = SecondFromFirst;
 
     fn len(&self) -> usize {
-        self.data.len()
+        self.matches.first.len()
     }
 
     fn sample_size(&self) -> usize {
-        3
+        S::SIZE
     }
 
     fn hypothesize(&mut self, rng: &mut ChaCha8Rng, models: &mut Vec<SecondFromFirst>) {
-        let sample = distinct::<3>(rng, self.len());
-        let (first, second) = (sample.map(|i| self.data.first[i]), sample.map(|i| self.data.second[i]));
-        let poses = upright_three_point(&first, &second);
-        models.extend(poses.iter().map(|&(rotation, translation)| SecondFromFirst { rotation, translation }));
+        self.sampler.hypothesize(self.matches, rng, models);
     }
 
     #[inline(always)]
     fn squared_residual(&self, model: &SecondFromFirst, index: usize, bound: f64) -> f64 {
-        const SQUARED: f64 = TILT_SLACK * TILT_SLACK;
-        self.data.squared_residual(model, index, bound * SQUARED) / SQUARED
+        let slack = const { S::SLACK * S::SLACK };
+        self.matches.squared_residual(model, index, bound * slack) / slack
     }
 
     fn refine(&self, model: &SecondFromFirst, inliers: &[u32], max_steps: usize) -> SecondFromFirst {
-        self.data.refine(model, inliers, max_steps)
+        self.matches.refine(model, inliers, max_steps)
     }
 }
 
-struct TurnedConsensus<'a> {
-    data: RelativeConsensus<'a>,
+struct Five;
+
+impl Sampler for Five {
+    const SIZE: usize = 5;
+
+    fn hypothesize(
+        &self,
+        matches: &RelativeMatches<'_>,
+        rng: &mut ChaCha8Rng,
+        models: &mut Vec<SecondFromFirst>,
+    ) {
+        let (first, second) = matches.sample::<5>(rng);
+        for essential in &five_point(&first, &second) {
+            for (rotation, translation) in &rotations_of_essential(essential) {
+                if first.iter().zip(&second).all(|(a, b)| is_in_front(&(rotation * a), translation, b)) {
+                    models.push(SecondFromFirst { rotation: *rotation, translation: *translation });
+                }
+            }
+        }
+    }
+}
+
+/// Takes both views for upright.
+struct Upright;
+
+impl Sampler for Upright {
+    const SIZE: usize = 3;
+    /// Tilted against each other by some degrees, views still have most of their matches within it.
+    const SLACK: f64 = 3.0;
+
+    fn hypothesize(
+        &self,
+        matches: &RelativeMatches<'_>,
+        rng: &mut ChaCha8Rng,
+        models: &mut Vec<SecondFromFirst>,
+    ) {
+        let (first, second) = matches.sample::<3>(rng);
+        let poses = upright_three_point(&first, &second);
+        models.extend(poses.iter().map(|&(rotation, translation)| SecondFromFirst { rotation, translation }));
+    }
+}
+
+/// Knows the rotation.
+struct Turned {
     rotation: Matrix3<f64>,
 }
 
-impl Consensus for TurnedConsensus<'_> {
-    type Model = SecondFromFirst;
+impl Sampler for Turned {
+    const SIZE: usize = 2;
 
-    fn len(&self) -> usize {
-        self.data.len()
-    }
-
-    fn sample_size(&self) -> usize {
-        2
-    }
-
-    fn hypothesize(&mut self, rng: &mut ChaCha8Rng, models: &mut Vec<SecondFromFirst>) {
-        let sample = distinct::<2>(rng, self.len());
-        let rays = sample.map(|i| (self.rotation * self.data.first[i], self.data.second[i]));
+    fn hypothesize(
+        &self,
+        matches: &RelativeMatches<'_>,
+        rng: &mut ChaCha8Rng,
+        models: &mut Vec<SecondFromFirst>,
+    ) {
+        let (first, second) = matches.sample::<2>(rng);
+        let first = first.map(|ray| self.rotation * ray);
         // The translation lies in the plane of either pair of rays.
-        let [a, b] = rays.map(|(first, second)| first.cross(&second));
+        let [a, b] = [0, 1].map(|at| first[at].cross(&second[at]));
         let Some(along) = a.cross(&b).try_normalize(1e-12) else { return };
         for translation in [along, -along] {
-            if rays.iter().all(|(first, second)| is_in_front(first, &translation, second)) {
+            if first.iter().zip(&second).all(|(a, b)| is_in_front(a, &translation, b)) {
                 models.push(SecondFromFirst { rotation: self.rotation, translation });
             }
         }
     }
-
-    #[inline(always)]
-    fn squared_residual(&self, model: &SecondFromFirst, index: usize, bound: f64) -> f64 {
-        self.data.squared_residual(model, index, bound)
-    }
-
-    fn refine(&self, model: &SecondFromFirst, inliers: &[u32], max_steps: usize) -> SecondFromFirst {
-        self.data.refine(model, inliers, max_steps)
-    }
 }
 
-struct RotationConsensus<'a>(RelativeConsensus<'a>);
+struct RotationConsensus<'a>(RelativeMatches<'a>);
 
 impl Consensus for RotationConsensus<'_> {
     type Model = Matrix3<f64>;
 
     fn len(&self) -> usize {
-        self.0.len()
+        self.0.first.len()
     }
 
     fn sample_size(&self) -> usize {
@@ -534,7 +556,7 @@ mod tests {
         let mut problem = RelativeProblem::exact(&mut rng, 30);
         problem.disturb(&mut rng, 0.05, 0.0);
         let sigmas = [(); 30].map(|()| 0.01);
-        let data = RelativeConsensus::new(
+        let data = RelativeMatches::new(
             &RansacParams::default(),
             &problem.first,
             &problem.second,
