@@ -1,4 +1,5 @@
 use opencv::core::{Mat, Size};
+use opencv::imgproc::INTER_AREA;
 
 use crate::decode::check_buffer;
 use crate::{DecodedImage, FeatureError, sift};
@@ -39,26 +40,19 @@ impl GreyImage {
         Ok(Self { width: width as usize, height: height as usize, values })
     }
 
-    /// Reduced by averaging so that no side is longer than `max_side`.
-    pub(crate) fn reduced(self, max_side: u32) -> Result<Self, FeatureError> {
-        let longer = self.width.max(self.height);
-        if longer <= max_side as usize {
-            return Ok(self);
-        }
-        let share = f64::from(max_side) / longer as f64;
-        self.resized([share, share])
-    }
-
-    /// Reduced by averaging, by these shares of its width and height.
-    pub(crate) fn resized(&self, share: [f64; 2]) -> Result<Self, FeatureError> {
+    /// Reduced by averaging, to these shares of its width and height.
+    pub(crate) fn reduced(&self, share: [f64; 2]) -> Result<Self, FeatureError> {
         let side = |side: usize, share: f64| ((side as f64 * share).round() as usize).max(1);
         let (width, height) = (side(self.width, share[0]), side(self.height, share[1]));
+        if (width, height) == (self.width, self.height) {
+            return Ok(self.clone());
+        }
         let mut values = vec![0; width * height];
         let mut run = || {
             let source = Mat::new_rows_cols_with_data(self.height as i32, self.width as i32, &self.values)?;
             let mut target = Mat::new_rows_cols_with_data_mut(height as i32, width as i32, &mut values)?;
             let size = Size::new(width as i32, height as i32);
-            opencv::imgproc::resize(&source, &mut target, size, 0.0, 0.0, opencv::imgproc::INTER_AREA)
+            opencv::imgproc::resize(&source, &mut target, size, 0.0, 0.0, INTER_AREA)
         };
         run().map_err(|error: opencv::Error| FeatureError::Detector { reason: error.message })?;
         Ok(Self { width, height, values })

@@ -1032,7 +1032,6 @@ impl Component<'_> {
         mates.filter_map(|mate| self.agrees_alone(joint, mate, depth)).reduce(|a, b| a && b)
     }
 
-    /// Median distance from a photo to the scene points that it sees, else to those that other photos from its standpoint
     /// Median distance of what a photo sees: the scene points that it or its standpoint sees, else these and the local points that
     /// another standpoint sees, too; zero where they are fewer than half of what a verdict asks for.
     ///

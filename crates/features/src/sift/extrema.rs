@@ -5,13 +5,18 @@ use super::{GREY_RANGE, SiftParams};
 use crate::vectorized::{Level, vectorized};
 
 /// Pixels along the border without keypoints.
-const BORDER: usize = 5;
+const BORDER: usize = 3;
+/// Pixels, and layers, from a pixel to the extremum that is told from it. Halfway between two, each may tell that it is nearer to the
+/// other one.
+const MAX_OFFSET: f32 = 0.6;
 /// Most moves of the interpolation to another pixel.
 const MAX_MOVES: usize = 5;
 /// Pixels that the interpolation may end from where it began.
 const MAX_WAY: usize = 5;
 /// Rows above and below that are read about a row that is scanned.
 pub(super) const REACH: usize = MAX_WAY + 1;
+/// Neighbours of a pixel in place and scale that come before it.
+const NEIGHBOURS_BEFORE: usize = 13;
 /// Flags that are looked at together.
 const CHUNK: usize = size_of::<u64>();
 
@@ -98,17 +103,17 @@ impl Scan {
         self.row = self.row.max(ready);
     }
 
-    /// Whether no neighbour in place and scale exceeds a pixel.
+    /// Whether a pixel exceeds its neighbours in place and scale; of equal ones the first does.
     fn is_extremum(&self, layer: usize, x: usize, y: usize) -> bool {
         let value = self.differences[layer][y % 3][x];
-        let neighbours = self.differences[layer - 1..=layer + 1]
+        let rows = self.differences[layer - 1..=layer + 1]
             .iter()
-            .flat_map(|rows| rows.iter().flat_map(|row| &row[x - 1..=x + 1]));
-        if value > 0.0 {
-            neighbours.into_iter().all(|&neighbour| value >= neighbour)
-        } else {
-            neighbours.into_iter().all(|&neighbour| value <= neighbour)
-        }
+            .flat_map(|rows| slots(y).map(|slot| &rows[slot][x - 1..=x + 1]));
+        let sign = value.signum();
+        rows.flatten().enumerate().all(|(at, &neighbour)| {
+            let excess = sign * (value - neighbour);
+            if at < NEIGHBOURS_BEFORE { excess > 0.0 } else { excess >= 0.0 }
+        })
     }
 }
 
@@ -193,7 +198,7 @@ fn refine(
         if !offset.iter().all(|offset| offset.abs() < 1e6) {
             return None;
         }
-        if offset.iter().all(|offset| offset.abs() < 0.5) {
+        if offset.iter().all(|offset| offset.abs() < MAX_OFFSET) {
             let contrast = (here + 0.5 * gradient.dot(&offset)) / GREY_RANGE;
             if f64::from(contrast.abs()) * (params.octave_layers as f64) < params.contrast_threshold {
                 return None;

@@ -1,7 +1,7 @@
 //! SIFT: D. G. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
 //!
-//! The image is usually doubled first, as Lowe advises. OpenCV's `SIFT` is the tests' reference and finds the same points; this
-//! one needs a third of its time and a quarter of its memory, because all layers are blurred a few rows at a time, those
+//! Lowe doubles the image first; here the caller says how much it is enlarged. Of a doubled one OpenCV's `SIFT`, the tests'
+//! reference, finds the same points; this one needs a third of its time and a quarter of its memory, because all layers are blurred a few rows at a time, those
 //! that no point is described on are kept no longer than they are read, pyramids are reused instead of being returned to
 //! the system, and only points that the caller keeps are described. It also says whether a point is bright or dark, which
 //! OpenCV's does not, and keeps places exact in octaves of odd size, where OpenCV's drift towards the right and bottom
@@ -9,6 +9,7 @@
 
 mod blur;
 mod descriptor;
+mod enlarged;
 mod extrema;
 mod octave;
 mod orientation;
@@ -18,6 +19,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::vectorized::Level;
 use descriptor::{DescriptorRows, Frame, describe, prefetch};
+use enlarged::Enlarged;
 use extrema::{Extremum, Scan};
 use octave::{Octave, Sigmas, Source};
 use orientation::{OrientationRows, orientations};
@@ -27,8 +29,6 @@ use crate::DESCRIPTOR_LEN;
 
 /// Contrasts are relative to this.
 const GREY_RANGE: f32 = 255.0;
-/// Blur in pixels that a photo has already.
-const PHOTO_SIGMA: f64 = 0.5;
 
 /// How to detect.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,16 +39,18 @@ pub(crate) struct SiftParams {
     pub min_points: usize,
     pub edge_threshold: f64,
     pub octave_layers: usize,
+    /// Blur of the first scale in pixels of the enlarged image.
     pub sigma_px: f64,
-    /// Whether the image is doubled first. If not, the finest points are not found, and the work is a quarter.
-    pub doubled: bool,
+    /// Blur that the enlarged image is taken to have already, in its pixels.
+    pub image_sigma_px: f64,
+    /// Pixels of the enlarged image per pixel, 1 or more.
+    pub enlargement: f64,
 }
 
 impl SiftParams {
     /// Width in image pixels of a pixel of this octave.
     fn pixel_of(&self, octave: u32) -> f32 {
-        let first = if self.doubled { 0.5 } else { 1.0 };
-        first * (octave as f32).exp2()
+        (f64::from(octave).exp2() / self.enlargement) as f32
     }
 
     /// Where the first pixel of every octave has its centre, in image pixels: decimation keeps it.
@@ -94,10 +96,11 @@ pub(crate) fn detect_and_describe(
 ) -> (Vec<SiftPoint>, Vec<[f32; DESCRIPTOR_LEN]>) {
     let level = Level::detect();
     let mut space = idle_workspaces().pop().unwrap_or_default();
-    let mut points = space.detect(level, params, image, &allows);
+    let enlarged = Enlarged::new(image, params.enlargement);
+    let mut points = space.detect(level, params, &enlarged, &allows);
     if points.len() < params.min_points {
         let weaker = SiftParams { contrast_threshold: params.weak_contrast_threshold, ..params.clone() };
-        points = space.detect(level, &weaker, image, &allows);
+        points = space.detect(level, &weaker, &enlarged, &allows);
     }
     let chosen: Vec<SiftPoint> = choose(&points).into_iter().map(|index| points[index]).collect();
     let descriptors = space.describe(level, params, &chosen);
@@ -164,16 +167,15 @@ impl Workspace {
         &mut self,
         level: Level,
         params: &SiftParams,
-        image: Grey<'_>,
+        image: &Enlarged<'_>,
         allows: impl Fn(f32, f32) -> bool,
     ) -> Vec<SiftPoint> {
         let layers = params.octave_layers;
         // Layer i has the blur σ·2^(i/layers); each is made from the one before.
         let sigma = |layer: usize| params.sigma_px * (layer as f64 / layers as f64).exp2();
         let step = |layer: usize| (sigma(layer).powi(2) - sigma(layer - 1).powi(2)).sqrt();
-        let photo_sigma = if params.doubled { 2.0 * PHOTO_SIGMA } else { PHOTO_SIGMA };
         let sigmas = Sigmas {
-            first: (params.sigma_px.powi(2) - photo_sigma.powi(2)).max(0.01).sqrt(),
+            first: (params.sigma_px.powi(2) - params.image_sigma_px.powi(2)).max(0.01).sqrt(),
             steps: (1..layers + 3).map(step).collect(),
         };
         let mut points = Vec::new();
@@ -186,7 +188,6 @@ impl Workspace {
             let current = &mut current[0];
             let source = match done.last() {
                 Some(finer) => Source::Finer(finer.layer(layers)),
-                None if params.doubled => Source::Doubled(image),
                 None => Source::Photo(image),
             };
             let (width, height) = source.size();

@@ -13,7 +13,8 @@ const PARAMS: SiftParams = SiftParams {
     edge_threshold: 10.0,
     octave_layers: 3,
     sigma_px: 1.6,
-    doubled: true,
+    image_sigma_px: 1.0,
+    enlargement: 2.0,
 };
 
 /// Bright and dark Gaussian spots of all sizes on grey.
@@ -40,14 +41,19 @@ fn all(width: usize, height: usize, values: &[u8]) -> (Vec<SiftPoint>, Vec<[f32;
     all_by(&PARAMS, width, height, values)
 }
 
+/// Of the image as OpenCV enlarges it: by linear interpolation.
 fn all_by(
     params: &SiftParams,
     width: usize,
     height: usize,
     values: &[u8],
 ) -> (Vec<SiftPoint>, Vec<[f32; DESCRIPTOR_LEN]>) {
-    let choose = |points: &[SiftPoint]| (0..points.len()).collect();
-    detect_and_describe(params, Grey { width, height, values }, |_, _| true, choose)
+    let linear = |distance: f64| (1.0 - distance.abs()).max(0.0);
+    let image = Enlarged::by(Grey { width, height, values }, params.enlargement, linear);
+    let (level, mut space) = (Level::detect(), Workspace::default());
+    let points = space.detect(level, params, &image, |_, _| true);
+    let descriptors = space.describe(level, params, &points);
+    (points, descriptors)
 }
 
 fn opencv(width: usize, height: usize, values: &[u8]) -> (Vec<KeyPoint>, Mat) {
@@ -69,11 +75,9 @@ fn finds_and_describes_the_points_that_opencv_does() {
     let image = spots(1, width, height);
     let (points, descriptors) = all(width, height, &image);
     let (reference, reference_descriptors) = opencv(width, height, &image);
-    assert!(points.len() > 500 && points.len().abs_diff(reference.len()) * 50 < points.len());
-    let mut twins = 0;
-    let mut similar = 0;
-    for (point, descriptor) in points.iter().zip(&descriptors) {
-        let twin = reference.iter().position(|other| {
+    let (mut twins, mut similar) = (0, 0);
+    for (at, other) in reference.iter().enumerate() {
+        let twin = points.iter().position(|point| {
             // OpenCV counts from the first pixel's centre and is a quarter of a pixel off.
             let (x, y) = (other.pt().x + 0.25, other.pt().y + 0.25);
             let turn = (other.angle().to_radians() - point.orientation).rem_euclid(std::f32::consts::TAU);
@@ -83,12 +87,14 @@ fn finds_and_describes_the_points_that_opencv_does() {
         });
         if let Some(twin) = twin {
             twins += 1;
-            let other = reference_descriptors.at_row::<f32>(twin as i32).unwrap();
-            similar += usize::from(cosine(descriptor, other) > 0.97);
+            let descriptor = reference_descriptors.at_row::<f32>(at as i32).unwrap();
+            similar += usize::from(cosine(&descriptors[twin], descriptor) > 0.97);
         }
     }
-    assert!(twins * 100 > points.len() * 96, "{twins} of {}", points.len());
+    assert!(reference.len() > 500 && twins * 100 > reference.len() * 93, "{twins} of {}", reference.len());
     assert!(similar * 100 > twins * 95, "{similar} of {twins}");
+    // Halfway between two pixels OpenCV's go to and fro and are given up, or end in the other one.
+    assert!(points.len() * 10 < reference.len() * 11, "{} in place of {}", points.len(), reference.len());
 }
 
 #[test]
@@ -96,7 +102,8 @@ fn coarse_points_need_no_doubling() {
     let (width, height) = (512, 384);
     let image = spots(4, width, height);
     let (doubled, doubled_descriptors) = all(width, height, &image);
-    let (points, descriptors) = all_by(&SiftParams { doubled: false, ..PARAMS }, width, height, &image);
+    let plain = SiftParams { image_sigma_px: 0.5, enlargement: 1.0, ..PARAMS };
+    let (points, descriptors) = all_by(&plain, width, height, &image);
     let (mut coarse, mut twins, mut similar) = (0, 0, 0);
     for (point, descriptor) in points.iter().zip(&descriptors).filter(|(point, _)| point.size > 8.0) {
         coarse += 1;
@@ -167,8 +174,8 @@ fn all_levels_give_the_same_bits() {
     let image = spots(4, width, height);
     let run = |level| {
         let mut space = Workspace::default();
-        let view = Grey { width, height, values: &image };
-        let points = space.detect(level, &PARAMS, view, |_, _| true);
+        let view = Enlarged::new(Grey { width, height, values: &image }, PARAMS.enlargement);
+        let points = space.detect(level, &PARAMS, &view, |_, _| true);
         let descriptors = space.describe(level, &PARAMS, &points);
         (format!("{points:?}"), descriptors)
     };

@@ -54,6 +54,7 @@ impl fmt::Display for Range {
 const RANGES: &[(&str, Range)] = &[
     ("features.max_features", Range::Within(1.0, 1e6)),
     ("features.max_side", Range::Within(32.0, 32_768.0)),
+    ("features.enlargement", Range::Within(1.0, 4.0)),
     ("features.contrast_threshold", Range::Positive),
     ("features.min_features", Range::NotNegative),
     ("features.edge_threshold", Range::Positive),

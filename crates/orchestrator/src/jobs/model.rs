@@ -164,8 +164,8 @@ fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, features: &stages
     } else {
         Camera::from_focal_guess(image.camera.width, image.camera.height, image.camera.width.into())
     };
-    // Decoded pixels and three layers of the doubled image with their smaller octaves, two bytes a pixel, and what passes through.
-    let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 64;
+    // Decoded pixels and three layers of the enlarged image with their smaller octaves, two bytes a pixel, and what passes through.
+    let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 32;
     let params = json!({ "features": features, "camera": camera });
     let (path, hash, features) = (image.path.clone(), image.hash, features.clone());
     let work = move |_: &Inputs<'_, '_>| {
