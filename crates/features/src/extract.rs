@@ -129,9 +129,9 @@ const CELLS: usize = 16;
 /// stored descriptors have about one length and squared distances are exact integers.
 ///
 /// A panorama that closes on itself is extended over its seam for detection and only keypoints inside are kept:
-/// nothing is lost or doubled there, but for what lies within a tenth of a pixel of it. Keypoints are chosen for strength and spread (see
-/// [`FeatureParams::even_share`]) and come strongest first. A point with two orientations is two keypoints. `mask`
-/// pixels of 0 give no keypoints. An image without texture gives empty features.
+/// nothing is lost or doubled there, but for what lies within a tenth of a pixel of it. Keypoints are chosen for
+/// strength and spread (see [`FeatureParams::even_share`]) and come strongest first. A point with two orientations is
+/// two keypoints. `mask` pixels of 0 give no keypoints. An image without texture gives empty features.
 ///
 /// Single-threaded: callers work on several images in parallel.
 ///
@@ -160,6 +160,7 @@ pub fn extract(
     let reduction = (f64::from(params.max_side) / f64::from(width.max(height))).min(1.0);
     let whole = GreyImage::from(image).wrapped(padding);
     let share = params.enlargement * reduction;
+    let enlargement = share.max(1.0);
     let grey = whole.reduced([share.min(1.0); 2])?;
     let source = Source {
         params,
@@ -171,15 +172,15 @@ pub fn extract(
         pixel: reduction.recip() as f32,
     };
     let mut features = ImageFeatures { width, height, ..ImageFeatures::default() };
-    let view = View { grey: &grey, enlargement: share.max(1.0), tilt: [1.0; 2] };
+    let view = View { grey: &grey, enlargement, tilt: [1.0; 2] };
     let (light, usual) = source.append_view(&view, params.max_features, &mut features);
     features.light = light;
     let is_faint = usual < params.min_features.min(params.max_features);
     let tilt = if is_faint { params.simulated_tilt.max(params.faint_tilt) } else { params.simulated_tilt };
     if tilt > 1.0 {
         for tilt in [[tilt, 1.0], [1.0, tilt]] {
-            let pixels = share.max(1.0).powi(2) * grey.values.len() as f64 / (tilt[0] * tilt[1]);
-            let share = if pixels > FULL_VIEW_PIXELS { 0.5 * share.max(1.0) } else { share.max(1.0) };
+            let pixels = enlargement.powi(2) * grey.values.len() as f64 / (tilt[0] * tilt[1]);
+            let share = if pixels > FULL_VIEW_PIXELS { 0.5 * enlargement } else { enlargement };
             let squeezed = grey.reduced(tilt.map(|tilt| share.min(1.0) / tilt))?;
             let start = features.len() as u32;
             let view = View { grey: &squeezed, enlargement: share.max(1.0), tilt };

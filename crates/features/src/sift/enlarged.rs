@@ -101,7 +101,7 @@ vectorized! {
 vectorized! {
     fn weigh_columns(row: &[f32], columns: &[Taps], target: &mut [f32]) {
         for (target, Taps { first, weights }) in target.iter_mut().zip(columns) {
-            let from: &[f32; TAPS] = row[*first..][..TAPS].try_into().unwrap_or(&[0.0; TAPS]);
+            let from = &row[*first..][..TAPS];
             *target = weights[0] * from[0] + weights[1] * from[1] + weights[2] * from[2] + weights[3] * from[3];
         }
     }

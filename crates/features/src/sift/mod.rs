@@ -1,10 +1,10 @@
 //! SIFT: D. G. Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
 //!
 //! Lowe doubles the image first; here the caller says how much it is enlarged. Of a doubled one OpenCV's `SIFT`, the tests'
-//! reference, finds the same points; this one needs a third of its time and a quarter of its memory, because all layers are blurred a few rows at a time, those
-//! that no point is described on are kept no longer than they are read, pyramids are reused instead of being returned to
-//! the system, and only points that the caller keeps are described. It also says whether a point is bright or dark, which
-//! OpenCV's does not, and keeps places exact in octaves of odd size, where OpenCV's drift towards the right and bottom
+//! reference, finds the same points; this one needs a third of its time and a quarter of its memory, because all layers are blurred
+//! a few rows at a time, those that no point is described on are kept no longer than they are read, pyramids are reused instead of
+//! being returned to the system, and only points that the caller keeps are described. It also says whether a point is bright or
+//! dark, which OpenCV's does not, and keeps places exact in octaves of odd size, where OpenCV's drift towards the right and bottom
 //! border.
 
 mod blur;
