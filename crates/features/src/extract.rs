@@ -16,7 +16,7 @@ pub struct FeatureParams {
     /// Most keypoints per image.
     pub max_features: usize,
     /// Longest side in pixels at which points are detected, but for `enlargement`; larger images are reduced first. Detection of
-    /// a 4096 × 2048 panorama takes about 0.4 GB, in proportion to its pixels.
+    /// a 4096 × 2048 panorama takes about 0.2 GB, in proportion to its pixels.
     pub max_side: u32,
     /// How many times its size an image that is no longer than `max_side` is made before points are detected, and larger ones to
     /// match.
@@ -159,16 +159,17 @@ pub fn extract(
     let padding = if camera.wraps_around() { width as usize / SEAM_SHARE } else { 0 };
     let reduction = (f64::from(params.max_side) / f64::from(width.max(height))).min(1.0);
     let whole = GreyImage::from(image).wrapped(padding);
+    let size = [whole.width, whole.height];
     let share = params.enlargement * reduction;
     let enlargement = share.max(1.0);
-    let grey = whole.reduced([share.min(1.0); 2])?;
+    let grey = if share < 1.0 { whole.reduced([share; 2])? } else { whole };
     let source = Source {
         params,
         image,
         camera,
         mask,
         padding: padding as f32,
-        size: [whole.width, whole.height],
+        size,
         pixel: reduction.recip() as f32,
     };
     let mut features = ImageFeatures { width, height, ..ImageFeatures::default() };
@@ -404,7 +405,7 @@ mod tests {
 
     /// In the middle of an octave: what lies just between two may be found in both.
     const BLOB: f64 = 4.7;
-    /// How far from its centre a blob may be found: a fiftieth of a pixel of the octave that it is found in.
+    /// How far from its centre a blob may be found: a fortieth of a pixel of the octave that it is found in.
     const NEAR: f64 = 0.08;
 
     /// Bright Gaussian blobs on grey, x periodic.

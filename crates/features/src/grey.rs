@@ -44,9 +44,6 @@ impl GreyImage {
     pub(crate) fn reduced(&self, share: [f64; 2]) -> Result<Self, FeatureError> {
         let side = |side: usize, share: f64| ((side as f64 * share).round() as usize).max(1);
         let (width, height) = (side(self.width, share[0]), side(self.height, share[1]));
-        if (width, height) == (self.width, self.height) {
-            return Ok(self.clone());
-        }
         let mut values = vec![0; width * height];
         let mut run = || {
             let source = Mat::new_rows_cols_with_data(self.height as i32, self.width as i32, &self.values)?;

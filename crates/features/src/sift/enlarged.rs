@@ -68,7 +68,8 @@ impl Taps {
     fn new(place: f64, weight: fn(f64) -> f64) -> Self {
         let at = place.floor();
         let weights = [0, 1, 2, 3].map(|tap| weight(at + f64::from(tap) - 1.0 - place) as f32);
-        Self { first: (at as isize + MARGIN as isize - 1).max(0) as usize, weights }
+        // Places begin at −½, so that this is 0 or more.
+        Self { first: (at + (MARGIN - 1) as f64) as usize, weights }
     }
 }
 
