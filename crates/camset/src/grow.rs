@@ -340,7 +340,7 @@ mod tests {
             index,
             grown: &grown.grown,
             doubtful: &[],
-            shared_errors: None,
+            errors: None,
         }
     }
 

@@ -16,7 +16,6 @@
 
 mod advice;
 mod anywhere;
-mod bearing_errors;
 mod common;
 mod common_turn;
 mod evidence;
@@ -27,6 +26,7 @@ mod observability;
 mod params;
 mod pictures;
 mod refine;
+mod scene_errors;
 mod set;
 mod single;
 mod stretch;
@@ -71,7 +71,7 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// directions of the scene's images share. 34: and how these change the stretch of panoramas. 35: focal lengths that a
 /// set's photos contradict; walls by what is more alike. 36: what matches err alike. 37: wrong matches do not stand for the
 /// noise of right ones. 38: photos that are stretched. 39: pictures of walls by the luma that JPEGs store.
-pub const VERSION: u32 = 39;
+pub const VERSION: u32 = 40;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

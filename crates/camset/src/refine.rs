@@ -11,11 +11,11 @@ use setloc_sfm::bundle::{
 };
 use setloc_sfm::{ImageId, Place, PointId, Rigid, WallSight};
 
-use crate::bearing_errors::HeldByScene;
 use crate::common::{CommonErrors, PoseError, shift_of_point};
 use crate::common_turn::CommonTurn;
 use crate::evidence::{PhotoRays, ray_error_sigmas};
 use crate::jackknife::honest_covariances;
+use crate::scene_errors::HeldByScene;
 use crate::stretch::{Freed, PhotoStretch};
 use crate::{Scene, SceneMatch};
 

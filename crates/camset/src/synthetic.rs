@@ -396,7 +396,7 @@ impl World {
             index,
             grown: &[],
             doubtful: &[],
-            shared_errors: None,
+            errors: None,
         }
     }
 

@@ -3,7 +3,7 @@ use serde::{Deserialize, Serialize};
 use setloc_features::{Calibration, Camera, ImageFeatures};
 use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::{
-    ImageId, OutvotedPair, PairGeometry, PointId, Reconstruction, Rigid, SharedErrors, Similarity,
+    ImageId, ModelErrors, OutvotedPair, PairGeometry, PointId, Reconstruction, Rigid, Similarity,
 };
 
 use crate::PathToScene;
@@ -23,8 +23,8 @@ pub struct Scene<'a> {
     pub grown: &'a [GrownImage],
     /// Images about which it may be folded ([`setloc_sfm::doubtful_images`]); ascending.
     pub doubtful: &'a [ImageId],
-    /// Errors that directions of its images share, where any are told.
-    pub shared_errors: Option<&'a SharedErrors>,
+    /// What it may be off, where that is told.
+    pub errors: Option<&'a ModelErrors>,
 }
 
 impl Scene<'_> {

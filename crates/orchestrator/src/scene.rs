@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use setloc_camset::GrownImage;
 use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::{ImageId, Reconstruction, Rigid, SharedErrors};
+use setloc_sfm::{ImageId, ModelErrors, Reconstruction, Rigid};
 
 use crate::codec::{self, Artifact};
 use crate::error::Hinted;
@@ -26,8 +26,8 @@ pub struct SceneFile {
     pub placed: Vec<bool>,
     /// Images of each component about which it may be folded; ascending.
     pub doubtful: Vec<Vec<ImageId>>,
-    /// Errors that directions of each component's images share, where any are told.
-    pub shared_errors: Vec<Option<SharedErrors>>,
+    /// What each component may be off, where that is told.
+    pub errors: Vec<Option<ModelErrors>>,
     /// Features of the images, by image id, as artifacts; empty where no component has registered an image. Photos that
     /// share too little with the points are matched with them ([`SceneFile::features_of`]).
     pub features: Vec<Block>,
@@ -47,7 +47,7 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 13);
+serde_artifact!(SceneFile, "scene", 14);
 
 /// Altitude of an origin where none was measured: heights are relative. A measured zero is positive.
 pub const NO_ALTITUDE: f64 = -0.0;
@@ -142,11 +142,7 @@ mod tests {
             components: vec![Reconstruction::default(); 3],
             indices: vec![SceneIndex::default(); 3],
             placed: vec![true, false, true],
-            shared_errors: vec![
-                None,
-                Some(SharedErrors::new(1e-4, vec![vec![None, Some(Rigid::identity())]])),
-                None,
-            ],
+            errors: vec![None, Some(ModelErrors::new(1e-4, vec![vec![None, Some(Rigid::identity())]])), None],
             ..SceneFile::default()
         };
         let read: SceneFile = codec::decode(&codec::encode(&scene).unwrap()).unwrap();

@@ -11,10 +11,10 @@ mod geometry;
 mod georegister;
 mod ground;
 mod mapper;
+mod model_errors;
 mod quality;
 mod reconstruction;
 pub mod robust;
-mod shared_errors;
 pub mod solvers;
 pub mod synthetic;
 mod two_view;
@@ -29,6 +29,7 @@ pub use mapper::{
     InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,
     MergeVerdict, Mosaic, PutativePair, RegistrationRecord, reconstruct,
 };
+pub use model_errors::{BearingField, ModelErrors, PoseDeviation};
 pub use quality::{
     OutvotedPair, PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess,
     doubtful_images,
@@ -37,6 +38,5 @@ pub use reconstruction::{
     AlignedTrack, BaselineLength, CameraId, ImageId, Observation, Place, PointId, Reconstruction,
     ReconstructionImage, ReconstructionPoint, StepPose,
 };
-pub use shared_errors::{BearingField, SharedErrors};
 pub use two_view::{PairGeometry, TWO_VIEW_VERSION, TwoView, TwoViewKind, TwoViewParams, verify_pair};
 pub use walls::{DistantPhoto, ScaleByWalls, WallSight, scale_by_walls};

@@ -1,3 +1,6 @@
+use std::collections::BTreeMap;
+
+use nalgebra::Matrix6;
 use serde_json::{Value, json};
 use setloc_camset::PhotoLocalization;
 use setloc_features::Wgs84;
@@ -25,6 +28,7 @@ pub fn scene_json(scene: &SceneFile) -> Value {
         .iter()
         .enumerate()
         .map(|(component, model)| {
+            let sigmas = sigmas_of(scene, component);
             let model = model.by_name();
             let observations = observations_of(&model);
             let images: Vec<Value> = (0..model.images.len() as u32)
@@ -39,6 +43,7 @@ pub fn scene_json(scene: &SceneFile) -> Value {
                     json!({
                         "name": image.name, "world_from_camera": pose.map(pose_json), "wgs84": place,
                         "camera": model.camera_of(id), "observations": observations[id.index()],
+                        "sigma": sigmas.get(image.name.as_str()),
                         "grown": grown.contains(image.name.as_str()),
                     })
                 })
@@ -54,6 +59,36 @@ pub fn scene_json(scene: &SceneFile) -> Value {
         "geo_origin": origin_json(scene), "components": components, "warnings": scene.warnings,
         "notes": scene.notes,
     })
+}
+
+/// One sigma of the poses of a component's images, by name: of the panoramas by what they may be off together, of photos that it has
+/// grown by as these were localized.
+fn sigmas_of(scene: &SceneFile, component: usize) -> BTreeMap<&str, Value> {
+    let Some(model) = scene.components.get(component) else { return BTreeMap::new() };
+    let errors = scene.errors.get(component).and_then(Option::as_ref);
+    let drawn = |id| {
+        let deviation = errors?.deviation(model, id)?;
+        Some(sigma_json(deviation.rotation_rad, deviation.center))
+    };
+    let grown = scene.grown.iter().filter(|_| component == 0);
+    let stated = grown.map(|grown| (grown.image, covariance_sigma_json(&grown.covariance)));
+    let of_panoramas = model.registered().filter_map(|id| Some((id, drawn(id)?)));
+    let named = |(id, sigma): (ImageId, Value)| Some((model.images.get(id.index())?.name.as_str(), sigma));
+    of_panoramas.chain(stated).filter_map(named).collect()
+}
+
+/// One sigma of a pose, of all directions together, in degrees and scene units.
+fn sigma_json(rotation_rad: f64, position: f64) -> Value {
+    json!({ "rotation_deg": rotation_rad.to_degrees(), "position": position })
+}
+
+/// The same of a covariance: rotation in radians, then centre.
+fn covariance_sigma_json(covariance: &Matrix6<f64>) -> Value {
+    let spread = |from: usize| {
+        let variances = (from..from + 3).map(|at| covariance[(at, at)]);
+        variances.sum::<f64>().max(0.0).sqrt()
+    };
+    sigma_json(spread(0), spread(3))
 }
 
 fn observations_of(model: &setloc_sfm::Reconstruction) -> Vec<usize> {
@@ -75,12 +110,7 @@ pub fn localizations_json(photos: &[PhotoLocalization], scene: &SceneFile) -> Va
         let covariance = photo
             .covariance
             .map(|c| c.row_iter().map(|row| row.iter().copied().collect::<Vec<f64>>()).collect::<Vec<_>>());
-        let sigma = photo.covariance.map(|c| {
-            let spread = |from: usize| {
-                (c[(from, from)] + c[(from + 1, from + 1)] + c[(from + 2, from + 2)]).max(0.0).sqrt()
-            };
-            json!({ "rotation_deg": spread(0).to_degrees(), "position": spread(3) })
-        });
+        let sigma = photo.covariance.as_ref().map(covariance_sigma_json);
         json!({
             "name": photo.name, "verdict": photo.verdict, "reasons": photo.reasons, "inliers": photo.inliers,
             "component": photo.component, "own_frame": !scene.shares_frame(photo.component),

@@ -190,7 +190,7 @@ pub(super) fn components_of<'a>(scene: &'a SceneFile, empty: &'a EmptyScene) -> 
         // Only the largest grows.
         grown: if component == 0 { &scene.grown } else { &[] },
         doubtful: scene.doubtful.get(component).map_or(&[], Vec::as_slice),
-        shared_errors: scene.shared_errors.get(component).and_then(Option::as_ref),
+        errors: scene.errors.get(component).and_then(Option::as_ref),
     };
     let mut components: Vec<Scene<'a>> =
         scene.components.iter().zip(&scene.indices).enumerate().map(component).collect();

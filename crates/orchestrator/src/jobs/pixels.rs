@@ -109,7 +109,7 @@ mod tests {
             index: &SceneIndex::default(),
             grown: &[],
             doubtful: &[],
-            shared_errors: None,
+            errors: None,
         };
         let at_hand = PicturesAtHand::new(&book, &[&kept]);
         let pictures = at_hand.of(&scene);

@@ -6,8 +6,8 @@ use serde_json::json;
 use setloc_features::{GeoPosition, ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
 use setloc_sfm::{
-    ImageId, MapperOutput, MeasuredPosition, MergeRecord, Reconstruction, ReconstructionImage, SharedErrors,
-    doubtful_images,
+    ImageId, MapperOutput, MeasuredPosition, MergeRecord, ModelErrors, PoseDeviation, Reconstruction,
+    ReconstructionImage, doubtful_images,
 };
 
 use super::choose_pairs;
@@ -184,10 +184,12 @@ pub fn add_scene(
             .zip(&doubtful)
             .filter_map(|(component, images)| doubt(component, images))
             .collect();
-        let shared_errors: Vec<Option<SharedErrors>> =
-            output.components.iter().map(SharedErrors::of_model).collect();
-        let notes_of_errors: Vec<String> =
-            shared_errors.iter().enumerate().filter_map(shared_errors_note).collect();
+        let errors: Vec<Option<ModelErrors>> = output.components.iter().map(ModelErrors::of_model).collect();
+        let is_placed = georegistrations().next() == Some(true) && origin.is_some();
+        let accuracy = (output.components.first().zip(errors.first().and_then(Option::as_ref))).and_then(
+            |(model, errors)| accuracy_note(model, errors, &names, if is_placed { " m" } else { "" }),
+        );
+        let notes_of_errors: Vec<String> = errors.iter().enumerate().filter_map(shared_errors_note).collect();
         let stretches: Vec<String> = output.components.iter().enumerate().filter_map(stretch_note).collect();
         let lengths: Vec<String> = (output.components.iter().enumerate())
             .filter_map(|numbered| lengths_note(numbered, &names))
@@ -196,7 +198,7 @@ pub fn add_scene(
             components,
             indices: copy,
             doubtful,
-            shared_errors,
+            errors,
             placed: georegistrations().map(|is_placed| is_placed && origin.is_some()).collect(),
             features,
             origin,
@@ -209,6 +211,7 @@ pub fn add_scene(
                 .chain(recall.as_ref().map(Recall::note))
                 .chain(fixes.as_deref().map(|fixes| positions::note(fixes, listed)))
                 .chain(relative)
+                .chain(accuracy)
                 .chain(lengths)
                 .chain(stretches)
                 .chain(notes_of_errors)
@@ -281,14 +284,44 @@ fn lengths_note((component, model): (usize, &Reconstruction), names: &[String]) 
 /// Steps that are named where a note is of many.
 const MAX_STEPS_NAMED: usize = 5;
 
-/// Says what errors the images of a component share, where any are told.
-fn shared_errors_note((component, errors): (usize, &Option<SharedErrors>)) -> Option<String> {
-    let degrees = errors.as_ref()?.sigma_rad().to_degrees();
-    let of_component = of_component(component);
+/// Says how well the poses of the largest component are known.
+fn accuracy_note(
+    model: &Reconstruction,
+    errors: &ModelErrors,
+    names: &[String],
+    unit: &str,
+) -> Option<String> {
+    let known = |image: ImageId| Some((image, errors.deviation(model, image)?));
+    let mut known: Vec<(ImageId, PoseDeviation)> = model.registered().filter_map(known).collect();
+    known.sort_by(|(_, a), (_, b)| a.rotation_rad.total_cmp(&b.rotation_rad));
+    let degrees = known.get(known.len() / 2)?.1.rotation_rad.to_degrees();
+    known.sort_by(|(_, a), (_, b)| a.center.total_cmp(&b.center));
+    let (median, (worst, most)) = (known.get(known.len() / 2)?.1.center, known.last()?);
     Some(format!(
-        "neighbouring bearings of an image{of_component} are off together by {degrees:.3}° (stitching, lenses), which \
-         covariances of photos have in them"
+        "relative to each other poses are known to {}{unit} and {degrees:.3}° (one sigma, medians; {} to {}{unit}), unless the \
+         model is folded",
+        significant(median),
+        names[worst.index()],
+        significant(most.center)
     ))
+}
+
+/// Two digits of a length that may have any unit.
+fn significant(length: f64) -> String {
+    let digits = if length > 0.0 { (1.0 - length.log10().floor()).clamp(0.0, 9.0) } else { 0.0 };
+    format!("{length:.*}", digits as usize)
+}
+
+/// Says what errors the images of a component share, where any are told.
+fn shared_errors_note((component, errors): (usize, &Option<ModelErrors>)) -> Option<String> {
+    let degrees = errors.as_ref()?.shared_sigma_rad().to_degrees();
+    let of_component = of_component(component);
+    (degrees > 0.0).then(|| {
+        format!(
+            "neighbouring bearings of an image{of_component} are off together by {degrees:.3}° (stitching, lenses), which \
+             covariances of photos have in them"
+        )
+    })
 }
 
 /// Says what images about which a model may be folded mean for photos.

@@ -1,14 +1,19 @@
 //! What an adjusted problem answers, to first order, when what it was adjusted to is changed a little.
 
+use nalgebra::Vector3;
+
 use super::camera_system::Budget;
 use super::normal_equations::{Model, NormalEquations};
 use super::residual::angular_squared;
 use super::spherical::{Layout, POSE_DIM, Spherical, bearing_and_weight};
-use super::{BundleProblem, RobustLoss, store};
+use super::{BundleObservation, BundleProblem, RobustLoss, store};
 
 /// Damping of the step, and what is tried where that is too little for the system to be definite in spite of rounding: the first is
 /// enough to keep a free gauge where it is, and too little for what bends a long chain to notice.
 const LAMBDAS: [f64; 3] = [1e-10, 1e-8, 1e-6];
+
+/// Largest factor on a residual: of Cauchy's loss that of three times its scale.
+const MAX_PULL: f64 = 10.0;
 
 impl BundleProblem {
     /// The same problem with what the loss makes of each observation and bearing, at the current state, in its noise: ρ′ + sρ″, the
@@ -36,6 +41,24 @@ impl BundleProblem {
             }
         }
         weighted
+    }
+
+    /// What the observations are off, as errors of their bearings (camera frames, across, in radians) that move the minimum of the
+    /// problem [`BundleProblem::reweighted`] as they move that of this one under the loss.
+    ///
+    /// They are r ρ′ / (ρ′ + sρ″), the residuals by a factor of at most [`MAX_PULL`]: what is farther off hardly pulls.
+    pub fn residuals_under(&self, loss: RobustLoss) -> Vec<Vector3<f64>> {
+        let residual = |seen: &BundleObservation| {
+            let pose = self.poses.get(seen.pose as usize)?;
+            let camera = self.cameras.get(pose.camera as usize)?;
+            let (bearing, inverse_sigma) = bearing_and_weight(camera, &seen.pixel, seen.noise_px)?;
+            let point = self.points.get(seen.point as usize)?.position;
+            let expected = pose.world_from_camera.inverse().transform_point(&point);
+            let squared = angular_squared(&bearing, &expected) * inverse_sigma.powi(2);
+            let pull = loss.evaluate(squared).1 / loss.mean_curvature(squared);
+            Some((bearing - expected.try_normalize(f64::MIN_POSITIVE)?) * pull.min(MAX_PULL))
+        };
+        self.observations.iter().map(|seen| residual(seen).unwrap_or_default()).collect()
     }
 }
 

@@ -651,6 +651,40 @@ fn a_step_is_what_an_adjustment_does_about_a_small_change() {
 }
 
 #[test]
+fn residuals_of_one_sign_move_no_minimum_and_those_of_one_point_do_as_leaving_it_out() {
+    for loss in [RobustLoss::Trivial, RobustLoss::Huber(1.0), RobustLoss::Cauchy(1.0)] {
+        let mut problem = scene(5, 300, 0.5, 24);
+        solve(&BundleParams { loss, ..tight() }, &mut problem);
+        let weighted = problem.reweighted(loss);
+        let residuals = problem.residuals_under(loss);
+        let respond = |factor: &dyn Fn(u32) -> f64| {
+            let mut moved = weighted.clone();
+            for (seen, residual) in moved.observations.iter_mut().zip(&residuals) {
+                let camera = &weighted.cameras[weighted.poses[seen.pose as usize].camera as usize];
+                let bearing = camera.unproject(&seen.pixel).unwrap() + residual * factor(seen.point);
+                seen.pixel = camera.project(&bearing).unwrap();
+            }
+            assert!(step(&mut moved));
+            moved
+        };
+        let unmoved = respond(&|_| 0.0);
+        let apart = |moved: &BundleProblem| largest_error(moved, &unmoved).1;
+        let one_of_many = apart(&respond(&|point| f64::from(u8::from(point < 30))));
+        let all = apart(&respond(&|_| 1.0));
+        // Cauchy's loss has some residuals at the largest factor.
+        let bound = if let RobustLoss::Cauchy(_) = loss { 0.25 } else { 0.02 };
+        assert!(all < bound * one_of_many, "{loss:?} {all} {one_of_many}");
+        // A point that pulls no more has its residuals taken off it.
+        let mut without = problem.clone();
+        without.observations.retain(|seen| seen.point >= 30);
+        solve(&BundleParams { loss, ..tight() }, &mut without);
+        let taken_off = respond(&|point| -f64::from(u8::from(point < 30)));
+        let (left_out, by_residuals) = (largest_error(&without, &problem).1, apart(&taken_off));
+        assert!((0.5..2.0).contains(&(by_residuals / left_out)), "{loss:?} {by_residuals} {left_out}");
+    }
+}
+
+#[test]
 fn a_step_moves_nothing_where_nothing_is_free_or_known() {
     let mut problem = scene(4, 100, 0.5, 23);
     for pose in &mut problem.poses {

@@ -1,7 +1,7 @@
-//! Errors of bearings that neighbouring directions of a scene's image share ([`setloc_sfm::SharedErrors`]).
+//! What a scene may be off ([`setloc_sfm::ModelErrors`]), in the poses of photos.
 //!
-//! Scene points of one region are off together, by the errors of the images that see them there and of the poses of these, and so
-//! is a photo that sees little else. As in [`crate::common`] these errors are *considered* rather than estimated: for each draw of
+//! Scene points of one region are off together, by the poses of the images that see them and by what their bearings share there, and
+//! so is a photo that sees little else. As in [`crate::common`] these errors are *considered* rather than estimated: for each draw of
 //! them the photos are adjusted again, and what their poses move by in the mean of the draws is added to their covariances.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use rayon::prelude::*;
 use setloc_sfm::bundle::{self, BundleParams, BundleProblem};
-use setloc_sfm::{BearingField, ImageId, PointId, SharedErrors};
+use setloc_sfm::{BearingField, ImageId, ModelErrors, PointId};
 
 use crate::Scene;
 use crate::jackknife::deviation;
@@ -27,7 +27,7 @@ pub(crate) struct HeldByScene {
 }
 
 impl HeldByScene {
-    /// What shared errors add to the covariances of the first poses of an adjusted problem; `None` when there are none.
+    /// What its errors add to the covariances of the first poses of an adjusted problem; `None` when there are none.
     pub(crate) fn spread(
         &self,
         scene: &Scene<'_>,
@@ -35,7 +35,7 @@ impl HeldByScene {
         problem: &BundleProblem,
         poses: usize,
     ) -> Option<Vec<Matrix6<f64>>> {
-        let errors = scene.shared_errors.filter(|errors| errors.draws() > 0)?;
+        let errors = scene.errors.filter(|errors| errors.draws() > 0)?;
         if self.far.is_empty() && self.views.is_empty() {
             return None;
         }
@@ -51,7 +51,7 @@ impl HeldByScene {
         let moved: Vec<_> = draws.par_iter().with_max_len(1).map(deviations).collect();
         let of_pose = |pose: usize| {
             let squared = moved.iter().map(|draw| draw[pose] * draw[pose].transpose());
-            squared.sum::<Matrix6<f64>>() / f64::from(errors.draws())
+            squared.sum::<Matrix6<f64>>() / errors.degrees_of_freedom()
         };
         Some((0..poses).map(of_pose).collect())
     }
@@ -85,13 +85,13 @@ impl HeldByScene {
 /// One draw of the errors.
 struct Draw<'a> {
     scene: &'a Scene<'a>,
-    errors: &'a SharedErrors,
+    errors: &'a ModelErrors,
     number: u32,
     fields: BTreeMap<ImageId, BearingField>,
 }
 
 impl<'a> Draw<'a> {
-    fn new(scene: &'a Scene<'a>, errors: &'a SharedErrors, number: u32, images: &BTreeSet<ImageId>) -> Self {
+    fn new(scene: &'a Scene<'a>, errors: &'a ModelErrors, number: u32, images: &BTreeSet<ImageId>) -> Self {
         let field = |&image: &ImageId| (image, errors.field(scene.reconstruction, image, number));
         let fields = images.iter().map(field).collect();
         Self { scene, errors, number, fields }
@@ -146,7 +146,7 @@ mod tests {
     fn points_go_where_their_panoramas_go() {
         let world = World::chain(1, 0.0, 71);
         let (motion, poses) = moved_together(&world, 1);
-        let errors = SharedErrors::new(0.0, poses);
+        let errors = ModelErrors::new(0.0, poses);
         let scene = world.scene();
         let images = scene.reconstruction.registered().collect();
         let draw = Draw::new(&scene, &errors, 0, &images);
@@ -160,7 +160,7 @@ mod tests {
     #[test]
     fn points_go_where_rays_with_errors_meet() {
         let world = World::chain(1, 0.0, 72);
-        let errors = SharedErrors::new(1e-3, vec![Vec::new()]);
+        let errors = ModelErrors::new(1e-3, vec![Vec::new()]);
         let scene = world.scene();
         let images = scene.reconstruction.registered().collect();
         let draw = Draw::new(&scene, &errors, 0, &images);
@@ -186,21 +186,22 @@ mod tests {
     #[test]
     fn what_all_panoramas_share_is_in_the_covariance_of_a_photo_beside_them() {
         let world = World::chain(2, 0.2, 73);
-        let alone = |errors: Option<&SharedErrors>| {
-            let scene = Scene { shared_errors: errors, ..world.scene() };
+        let alone = |errors: Option<&ModelErrors>| {
+            let scene = Scene { errors, ..world.scene() };
             let photo = world.queries()[0];
             let found = crate::locate_single(&crate::SingleParams::default(), &scene, &photo, 1);
             found.photo.covariance.expect("is localized")
         };
         let (motion, poses) = moved_together(&world, 16);
-        let errors = SharedErrors::new(0.0, poses);
+        let errors = ModelErrors::new(0.0, poses);
         let added = alone(Some(&errors)) - alone(None);
-        // A common motion moves the photo as a point of the scene; sixteen equal draws are one standard deviation.
+        // A common motion moves the photo as a point of the scene; sixteen equal draws are one standard deviation of a
+        // covariance that is known to twelve degrees of freedom.
         let center = world.photos[0].pose.translation;
         let shift = motion.transform_point(&center) - center;
-        let expected = shift * shift.transpose();
+        let expected = shift * shift.transpose() * (16.0 / 12.0);
         let center = added.fixed_view::<3, 3>(3, 3).into_owned();
         assert!((center - expected).norm() < 0.1 * expected.norm(), "{center} {expected}");
-        assert_eq!(alone(Some(&SharedErrors::new(1.0, Vec::new()))), alone(None));
+        assert_eq!(alone(Some(&ModelErrors::new(1.0, Vec::new()))), alone(None));
     }
 }
