@@ -100,9 +100,11 @@ fn a_data_set_by_path_keeps_its_results_schema() {
         "observations",
         "points",
         "position_m",
+        "position_sigma_m",
         "registered",
         "rotation_deg",
         "rotation_own_deg",
+        "rotation_sigma_deg",
     ];
     assert_eq!(keys(&results["scene"]), scene);
     let set = &results["sets"][0];

@@ -70,6 +70,11 @@ pub struct Alignment {
 }
 
 impl Alignment {
+    /// Units of the truth in one of the scene.
+    pub fn scale(&self) -> f64 {
+        self.truth_from_scene.scale
+    }
+
     /// Least squares over the centres of the images that both know; `None` with fewer than 3 or all in one line.
     pub fn of_centres(estimated: &BTreeMap<String, Rigid>, truth: &BTreeMap<String, Rigid>) -> Option<Self> {
         let common = estimated
@@ -200,6 +205,10 @@ pub struct SceneFigures {
     pub rotation_deg: Option<Spread>,
     /// Rotation errors after alignment by rotations.
     pub rotation_own_deg: Option<Spread>,
+    /// What the scene states its centres may be off, one sigma of all directions together, in units of the truth.
+    pub position_sigma_m: Option<Spread>,
+    /// The same of rotations.
+    pub rotation_sigma_deg: Option<Spread>,
     /// AUC of relative poses in percent, by threshold in degrees.
     pub auc: Option<BTreeMap<String, f64>>,
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use serde::Serialize;
 use setloc_camset::{PhotoLocalization, Verdict};
-use setloc_sfm::{Reconstruction, Rigid};
+use setloc_sfm::{PoseDeviation, Reconstruction, Rigid};
 
 use super::figures::{mean_angular_error_px, own_rotation_errors_deg};
 use super::{
@@ -168,7 +168,15 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     let alignment = Alignment::of_centres(&estimated, &true_scene);
     let alignments = alignments_of(&built.scene, &true_scene);
     let scene_errors = alignment.as_ref().map_or_else(Errors::new, |a| errors_of(a, &estimated, &true_scene));
-    let scene = scene_figures(files.len(), &built, &model, &estimated, &true_scene, &scene_errors);
+    let scene = scene_figures(
+        files.len(),
+        &built,
+        &model,
+        &estimated,
+        &true_scene,
+        alignment.as_ref(),
+        &scene_errors,
+    );
     let mut sets = Vec::new();
     let mut skipped = built.skipped.clone();
     let mut skipped_sets = BTreeMap::new();
@@ -288,9 +296,15 @@ fn scene_figures(
     model: &Reconstruction,
     estimated: &BTreeMap<String, Rigid>,
     truth: &BTreeMap<String, Rigid>,
+    alignment: Option<&Alignment>,
     errors: &Errors,
 ) -> SceneFigures {
     let spread = |value: fn(&PoseError) -> f64| Bounds::of(errors.values().map(value)).map(Into::into);
+    let stated = |value: &dyn Fn(PoseDeviation) -> f64| {
+        let (model, errors) = built.scene.components.first().zip(built.scene.errors.first()?.as_ref())?;
+        let deviations = model.registered().filter_map(|id| errors.deviation(model, id));
+        Bounds::of(deviations.map(value)).map(Into::into)
+    };
     let auc = || AUC_THRESHOLDS_DEG.iter().map(f64::to_string).zip(auc_percent(estimated, truth)).collect();
     SceneFigures {
         images,
@@ -302,6 +316,8 @@ fn scene_figures(
         position_m: spread(|error| error.position_m),
         rotation_deg: spread(|error| error.rotation_deg),
         rotation_own_deg: Bounds::of(own_rotation_errors_deg(estimated, truth)).map(Into::into),
+        position_sigma_m: alignment.and_then(|alignment| stated(&|sigma| sigma.center * alignment.scale())),
+        rotation_sigma_deg: stated(&|sigma| sigma.rotation_rad.to_degrees()),
         auc: (!truth.is_empty()).then(auc),
     }
 }

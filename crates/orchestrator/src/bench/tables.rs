@@ -72,6 +72,8 @@ fn scene_table(text: &mut String, figures: &DatasetFigures) {
         ("position m", scene.position_m),
         ("rotation °", scene.rotation_deg),
         ("rotation ° (own alignment)", scene.rotation_own_deg),
+        ("position m, as stated (one sigma)", scene.position_sigma_m),
+        ("rotation °, as stated", scene.rotation_sigma_deg),
     ];
     if scene.position_m.is_some() {
         *text += "\n| error | median | mean | max |\n|---|---|---|---|\n";

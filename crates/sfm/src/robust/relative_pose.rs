@@ -51,7 +51,7 @@ pub fn estimate_relative_pose(
     seed: u64,
 ) -> Option<RelativePoseEstimate> {
     let matches = RelativeMatches::new(params, first, second, sigmas_first, sigmas_second)?;
-    Some(lo_ransac(params, &mut Sampled { matches: &matches, sampler: Five }, seed)?.into())
+    Some(lo_ransac(params, &mut Sampled::<_, 5> { matches: &matches, sampler: Five }, seed)?.into())
 }
 
 /// [`estimate_relative_pose`] where the y axes of both views are vertical to a few degrees: `upright` samples of three, scored with
@@ -71,8 +71,9 @@ pub(crate) fn estimate_level_pose(
 ) -> Option<RelativePoseEstimate> {
     let matches = &RelativeMatches::new(params, first, second, sigmas_first, sigmas_second)?;
     let begun = RansacParams { max_iterations: upright, ..params.clone() };
-    let start = lo_ransac(&begun, &mut Sampled { matches, sampler: Upright }, seed).map(|found| found.model);
-    Some(lo_ransac_from(start, params, &mut Sampled { matches, sampler: Five }, seed)?.into())
+    let start =
+        lo_ransac(&begun, &mut Sampled::<_, 3> { matches, sampler: Upright }, seed).map(|found| found.model);
+    Some(lo_ransac_from(start, params, &mut Sampled::<_, 5> { matches, sampler: Five }, seed)?.into())
 }
 
 /// [`estimate_relative_pose`] where the rotation is known to a few degrees: two-point LO-RANSAC of the direction of the
@@ -88,7 +89,7 @@ pub(crate) fn estimate_turned_pose(
 ) -> Option<RelativePoseEstimate> {
     let matches = RelativeMatches::new(params, first, second, sigmas_first, sigmas_second)?;
     let sampler = Turned { rotation: second_from_first.to_rotation_matrix().into_inner() };
-    Some(lo_ransac(params, &mut Sampled { matches: &matches, sampler }, seed)?.into())
+    Some(lo_ransac(params, &mut Sampled::<_, 2> { matches: &matches, sampler }, seed)?.into())
 }
 
 /// Refines a relative pose by Levenberg–Marquardt with a Cauchy loss on the given pairs (all indices must be valid).
@@ -179,12 +180,6 @@ impl<'a> RelativeMatches<'a> {
             variances: sigmas_first.iter().zip(sigmas_second).map(|(a, b)| (a * a, b * b)).collect(),
             inverse_scale_squared: cauchy_scale(params),
         })
-    }
-
-    /// The bearings of some matches, drawn at random.
-    fn sample<const N: usize>(&self, rng: &mut ChaCha8Rng) -> ([Vector3<f64>; N], [Vector3<f64>; N]) {
-        let sample = distinct::<N>(rng, self.first.len());
-        (sample.map(|i| self.first[i]), sample.map(|i| self.second[i]))
     }
 
     /// Sampson residual and, on request, its derivative over (δω, δt) with R ← exp(δω)·R, t ← t + δt (3 + 3).
@@ -304,29 +299,22 @@ fn sampson_derivative(
     ((error_turn - variance_turn * ratio) * inverse, (error_shift - variance_shift * ratio) * inverse)
 }
 
-/// Poses of samples of matches, by a minimal solver.
-trait Sampler {
-    /// Matches in a sample.
-    const SIZE: usize;
+/// Relative poses of samples of `N` matches, by a minimal solver.
+trait Sampler<const N: usize> {
     /// How many times the bound a match may be off such a pose.
     const SLACK: f64 = 1.0;
 
-    /// Draws a sample and appends its poses.
-    fn hypothesize(
-        &self,
-        matches: &RelativeMatches<'_>,
-        rng: &mut ChaCha8Rng,
-        models: &mut Vec<SecondFromFirst>,
-    );
+    /// Appends the poses of a sample: bearings of the first view, and those of the second that match them.
+    fn solve(&self, first: &[Vector3<f64>; N], second: &[Vector3<f64>; N], models: &mut Vec<SecondFromFirst>);
 }
 
 /// Relative poses by samples of one kind.
-struct Sampled<'m, 'a, S> {
+struct Sampled<'m, 'a, S, const N: usize> {
     matches: &'m RelativeMatches<'a>,
     sampler: S,
 }
 
-impl<S: Sampler> Consensus for Sampled<'_, '_, S> {
+impl<S: Sampler<N>, const N: usize> Consensus for Sampled<'_, '_, S, N> {
     type Model = SecondFromFirst;
 
     fn len(&self) -> usize {
@@ -334,11 +322,14 @@ impl<S: Sampler> Consensus for Sampled<'_, '_, S> {
     }
 
     fn sample_size(&self) -> usize {
-        S::SIZE
+        N
     }
 
     fn hypothesize(&mut self, rng: &mut ChaCha8Rng, models: &mut Vec<SecondFromFirst>) {
-        self.sampler.hypothesize(self.matches, rng, models);
+        let sample = distinct::<N>(rng, self.matches.first.len());
+        let first = sample.map(|i| self.matches.first[i]);
+        let second = sample.map(|i| self.matches.second[i]);
+        self.sampler.solve(&first, &second, models);
     }
 
     #[inline(always)]
@@ -354,19 +345,16 @@ impl<S: Sampler> Consensus for Sampled<'_, '_, S> {
 
 struct Five;
 
-impl Sampler for Five {
-    const SIZE: usize = 5;
-
-    fn hypothesize(
+impl Sampler<5> for Five {
+    fn solve(
         &self,
-        matches: &RelativeMatches<'_>,
-        rng: &mut ChaCha8Rng,
+        first: &[Vector3<f64>; 5],
+        second: &[Vector3<f64>; 5],
         models: &mut Vec<SecondFromFirst>,
     ) {
-        let (first, second) = matches.sample::<5>(rng);
-        for essential in &five_point(&first, &second) {
+        for essential in &five_point(first, second) {
             for (rotation, translation) in &rotations_of_essential(essential) {
-                if first.iter().zip(&second).all(|(a, b)| is_in_front(&(rotation * a), translation, b)) {
+                if first.iter().zip(second).all(|(a, b)| is_in_front(&(rotation * a), translation, b)) {
                     models.push(SecondFromFirst { rotation: *rotation, translation: *translation });
                 }
             }
@@ -377,19 +365,17 @@ impl Sampler for Five {
 /// Takes both views for upright.
 struct Upright;
 
-impl Sampler for Upright {
-    const SIZE: usize = 3;
+impl Sampler<3> for Upright {
     /// Tilted against each other by some degrees, views still have most of their matches within it.
     const SLACK: f64 = 3.0;
 
-    fn hypothesize(
+    fn solve(
         &self,
-        matches: &RelativeMatches<'_>,
-        rng: &mut ChaCha8Rng,
+        first: &[Vector3<f64>; 3],
+        second: &[Vector3<f64>; 3],
         models: &mut Vec<SecondFromFirst>,
     ) {
-        let (first, second) = matches.sample::<3>(rng);
-        let poses = upright_three_point(&first, &second);
+        let poses = upright_three_point(first, second);
         models.extend(poses.iter().map(|&(rotation, translation)| SecondFromFirst { rotation, translation }));
     }
 }
@@ -399,22 +385,19 @@ struct Turned {
     rotation: Matrix3<f64>,
 }
 
-impl Sampler for Turned {
-    const SIZE: usize = 2;
-
-    fn hypothesize(
+impl Sampler<2> for Turned {
+    fn solve(
         &self,
-        matches: &RelativeMatches<'_>,
-        rng: &mut ChaCha8Rng,
+        first: &[Vector3<f64>; 2],
+        second: &[Vector3<f64>; 2],
         models: &mut Vec<SecondFromFirst>,
     ) {
-        let (first, second) = matches.sample::<2>(rng);
         let first = first.map(|ray| self.rotation * ray);
         // The translation lies in the plane of either pair of rays.
         let [a, b] = [0, 1].map(|at| first[at].cross(&second[at]));
         let Some(along) = a.cross(&b).try_normalize(1e-12) else { return };
         for translation in [along, -along] {
-            if first.iter().zip(&second).all(|(a, b)| is_in_front(a, &translation, b)) {
+            if first.iter().zip(second).all(|(a, b)| is_in_front(a, &translation, b)) {
                 models.push(SecondFromFirst { rotation: self.rotation, translation });
             }
         }
