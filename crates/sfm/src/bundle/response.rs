@@ -46,7 +46,7 @@ impl BundleProblem {
     /// What the observations are off, as errors of their bearings (camera frames, across, in radians) that move the minimum of the
     /// problem [`BundleProblem::reweighted`] as they move that of this one under the loss.
     ///
-    /// They are r ρ′ / (ρ′ + sρ″), the residuals by a factor of at most [`MAX_PULL`]: what is farther off hardly pulls.
+    /// They are r ρ′ / (ρ′ + sρ″), the residuals by a factor of at most ten: what is farther off hardly pulls.
     pub fn residuals_under(&self, loss: RobustLoss) -> Vec<Vector3<f64>> {
         let residual = |seen: &BundleObservation| {
             let pose = self.poses.get(seen.pose as usize)?;
