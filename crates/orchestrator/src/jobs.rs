@@ -1,5 +1,6 @@
 //! The job kinds and how they depend on each other.
 
+mod accuracy;
 mod alignment;
 mod grow;
 mod likely;

@@ -6,10 +6,11 @@ use serde_json::json;
 use setloc_features::{GeoPosition, ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
 use setloc_sfm::{
-    ImageId, MapperOutput, MeasuredPosition, MergeRecord, ModelErrors, PoseDeviation, Reconstruction,
-    ReconstructionImage, doubtful_images,
+    ImageId, MapperOutput, MeasuredPosition, MergeRecord, ModelErrors, Reconstruction, ReconstructionImage,
+    doubtful_images,
 };
 
+use super::accuracy::Accuracy;
 use super::choose_pairs;
 use super::model::{
     ModelJobs, ModelKind, ModelSource, add_model, features_role, image_of_place_holder, with_names,
@@ -186,9 +187,12 @@ pub fn add_scene(
             .collect();
         let errors: Vec<Option<ModelErrors>> = output.components.iter().map(ModelErrors::of_model).collect();
         let is_placed = georegistrations().next() == Some(true) && origin.is_some();
-        let accuracy = (output.components.first().zip(errors.first().and_then(Option::as_ref))).and_then(
-            |(model, errors)| accuracy_note(model, errors, &names, if is_placed { " m" } else { "" }),
-        );
+        let accuracies: Vec<Accuracy> = (output.components.iter().zip(&errors))
+            .filter_map(|(model, errors)| Accuracy::of_model(model, errors.as_ref()?))
+            .collect();
+        let accuracy =
+            accuracies.first().and_then(|accuracy| accuracy.note(&names, if is_placed { " m" } else { "" }));
+        let weak: Vec<String> = accuracies.iter().filter_map(|accuracy| accuracy.warning(&names)).collect();
         let notes_of_errors: Vec<String> = errors.iter().enumerate().filter_map(shared_errors_note).collect();
         let stretches: Vec<String> = output.components.iter().enumerate().filter_map(stretch_note).collect();
         let lengths: Vec<String> = (output.components.iter().enumerate())
@@ -204,6 +208,7 @@ pub fn add_scene(
             origin,
             warnings: (output.report.warnings.iter().map(|text| with_names(text, &names)))
                 .chain(doubts)
+                .chain(weak)
                 .chain(recall.as_ref().filter(|recall| recall.share < MIN_RECALL).map(Recall::warning))
                 .chain(fixes.as_deref().and_then(positions::warning))
                 .collect(),
@@ -283,34 +288,6 @@ fn lengths_note((component, model): (usize, &Reconstruction), names: &[String]) 
 
 /// Steps that are named where a note is of many.
 const MAX_STEPS_NAMED: usize = 5;
-
-/// Says how well the poses of the largest component are known.
-fn accuracy_note(
-    model: &Reconstruction,
-    errors: &ModelErrors,
-    names: &[String],
-    unit: &str,
-) -> Option<String> {
-    let known = |image: ImageId| Some((image, errors.deviation(model, image)?));
-    let mut known: Vec<(ImageId, PoseDeviation)> = model.registered().filter_map(known).collect();
-    known.sort_by(|(_, a), (_, b)| a.rotation_rad.total_cmp(&b.rotation_rad));
-    let degrees = known.get(known.len() / 2)?.1.rotation_rad.to_degrees();
-    known.sort_by(|(_, a), (_, b)| a.center.total_cmp(&b.center));
-    let (median, (worst, most)) = (known.get(known.len() / 2)?.1.center, known.last()?);
-    Some(format!(
-        "relative to each other poses are known to {}{unit} and {degrees:.3}° (one sigma, medians; {} to {}{unit}), unless the \
-         model is folded",
-        significant(median),
-        names[worst.index()],
-        significant(most.center)
-    ))
-}
-
-/// Two digits of a length that may have any unit.
-fn significant(length: f64) -> String {
-    let digits = if length > 0.0 { (1.0 - length.log10().floor()).clamp(0.0, 9.0) } else { 0.0 };
-    format!("{length:.*}", digits as usize)
-}
 
 /// Says what errors the images of a component share, where any are told.
 fn shared_errors_note((component, errors): (usize, &Option<ModelErrors>)) -> Option<String> {
