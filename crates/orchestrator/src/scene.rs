@@ -43,7 +43,8 @@ pub struct SceneFile {
     pub grown: Vec<GrownImage>,
     /// Contents of these photos' files, in the same order.
     pub grown_from: Vec<ContentHash>,
-    /// Hash of what localization depends on: the models and the index, not how images are called or what was set.
+    /// Hash of what localization depends on: the models, the index and the version of what else is made of them, not how images are
+    /// called or what was set.
     pub content: ContentHash,
 }
 

@@ -81,7 +81,7 @@ impl ModelErrors {
         let of_draw = |draw: u32| {
             let fields: Vec<BearingField> =
                 images.iter().map(|&image| BearingField::new(shared_sigma_rad, image, draw)).collect();
-            let mut rng = ChaCha8Rng::seed_from_u64(u64::from(draw));
+            let mut rng = ChaCha8Rng::seed_from_u64(!u64::from(draw));
             let mut sign = |_| if rng.random_bool(0.5) { 1.0 } else { -1.0 };
             let signs: Vec<f64> = (0..model.points.len()).map(&mut sign).collect();
             let mut drawn = problem.clone();
@@ -150,17 +150,18 @@ impl ModelErrors {
         (f64::from(self.draws()) - 4.0).max(1.0)
     }
 
-    /// One standard deviation of an image's rotation, in radians, and of its centre, of all directions together; `None` without a
-    /// pose.
+    /// What the pose of an image of `model` may be off; `None` for one that is in no draw.
     pub fn deviation(&self, model: &Reconstruction, image: ImageId) -> Option<PoseDeviation> {
         let pose = model.images.get(image.index())?.world_from_camera?;
         let (mut rotation, mut center) = (0.0, 0.0);
-        for drawn in (0..self.draws()).filter_map(|draw| self.pose(image, draw)) {
+        for draw in 0..self.draws() {
+            let drawn = self.pose(image, draw)?;
             rotation += pose.rotation.angle_to(&drawn.rotation).powi(2);
             center += (drawn.translation - pose.translation).norm_squared();
         }
         let deviation = |squares: f64| (squares / self.degrees_of_freedom()).sqrt();
-        Some(PoseDeviation { rotation_rad: deviation(rotation), center: deviation(center) })
+        let stated = PoseDeviation { rotation_rad: deviation(rotation), center: deviation(center) };
+        (self.draws() > 0).then_some(stated)
     }
 
     /// The errors of the bearings of an image of `model` in a draw.

@@ -163,7 +163,8 @@ pub fn add_scene(
             || features_of_registered(inputs, &output),
         );
         let features = features?;
-        let mut content = vec![inputs.hash("model")?, inputs.hash("index")?];
+        let made_by = ContentHash::of(&stages::SCENE_VERSION.to_le_bytes());
+        let mut content = vec![inputs.hash("model")?, inputs.hash("index")?, made_by];
         for image in output.components.iter().take(1).flat_map(|model| &model.images) {
             let at = image_of_place_holder(&image.name).unwrap_or_default();
             content.push(inputs.hash(&features_role(at))?);
@@ -187,12 +188,14 @@ pub fn add_scene(
             .collect();
         let errors: Vec<Option<ModelErrors>> = output.components.iter().map(ModelErrors::of_model).collect();
         let is_placed = georegistrations().next() == Some(true) && origin.is_some();
-        let accuracies: Vec<Accuracy> = (output.components.iter().zip(&errors))
-            .filter_map(|(model, errors)| Accuracy::of_model(model, errors.as_ref()?))
+        let unit = if is_placed { " m" } else { "" };
+        let accuracies: Vec<Option<Accuracy>> = (output.components.iter().zip(&errors))
+            .map(|(model, errors)| Accuracy::of_model(model, errors.as_ref()?))
             .collect();
-        let accuracy =
-            accuracies.first().and_then(|accuracy| accuracy.note(&names, if is_placed { " m" } else { "" }));
-        let weak: Vec<String> = accuracies.iter().filter_map(|accuracy| accuracy.warning(&names)).collect();
+        let of_largest = accuracies.first().and_then(Option::as_ref);
+        let accuracy = of_largest.and_then(|accuracy| accuracy.note(&names, unit));
+        let weak: Vec<String> =
+            accuracies.iter().flatten().filter_map(|accuracy| accuracy.warning(&names)).collect();
         let notes_of_errors: Vec<String> = errors.iter().enumerate().filter_map(shared_errors_note).collect();
         let stretches: Vec<String> = output.components.iter().enumerate().filter_map(stretch_note).collect();
         let lengths: Vec<String> = (output.components.iter().enumerate())
