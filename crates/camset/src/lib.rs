@@ -71,6 +71,7 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// directions of the scene's images share. 34: and how these change the stretch of panoramas. 35: focal lengths that a
 /// set's photos contradict; walls by what is more alike. 36: what matches err alike. 37: wrong matches do not stand for the
 /// noise of right ones. 38: photos that are stretched. 39: pictures of walls by the luma that JPEGs store.
+/// 40: what the scene's poses may be off.
 pub const VERSION: u32 = 40;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.

@@ -67,7 +67,7 @@ impl Accuracy {
         // What is no number is not known either.
         let mut weak: Vec<&Known> = self.images.iter().filter(|known| !(known.share <= WEAK)).collect();
         weak.sort_by(|a, b| b.share.total_cmp(&a.share));
-        let named = weak.iter().take(MAX_NAMED).map(|known| {
+        let named = weak.iter().map(|known| {
             let name = &names[known.image.index()];
             if known.share < UNKNOWN {
                 format!("{name} (± {:.0} %)", 100.0 * known.share)
@@ -75,18 +75,24 @@ impl Accuracy {
                 name.clone() + " (not at all)"
             }
         });
-        let mut named: Vec<String> = named.collect();
-        if weak.len() > MAX_NAMED {
-            named.push(format!("and {} more", weak.len() - MAX_NAMED));
-        }
         (!weak.is_empty()).then(|| {
             format!(
                 "what holds these images is weak or contradicts itself, and they may be misplaced (one sigma, of the distance to \
                  the nearest other): {}",
-                named.join(", ")
+                first_of(named.collect(), MAX_NAMED)
             )
         })
     }
+}
+
+/// The first of some names, with how many more there are.
+pub(super) fn first_of(mut names: Vec<String>, most: usize) -> String {
+    let more = names.len().saturating_sub(most);
+    names.truncate(most);
+    if more > 0 {
+        names.push(format!("and {more} more"));
+    }
+    names.join(", ")
 }
 
 /// Two digits of a length that may have any unit.

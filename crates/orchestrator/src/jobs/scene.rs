@@ -10,7 +10,7 @@ use setloc_sfm::{
     doubtful_images,
 };
 
-use super::accuracy::Accuracy;
+use super::accuracy::{Accuracy, first_of};
 use super::choose_pairs;
 use super::model::{
     ModelJobs, ModelKind, ModelSource, add_model, features_role, image_of_place_holder, with_names,
@@ -273,19 +273,14 @@ fn stretch_note((component, model): (usize, &Reconstruction)) -> Option<String> 
 fn lengths_note((component, model): (usize, &Reconstruction), names: &[String]) -> Option<String> {
     let percents = || model.lengths.iter().map(|length| 100.0 * length.deviation);
     let (least, most) = (percents().reduce(f64::min)?, percents().reduce(f64::max)?);
-    let mut steps: Vec<String> = (model.lengths.iter())
+    let steps: Vec<String> = (model.lengths.iter())
         .map(|length| format!("{} from {}", names[length.to.index()], names[length.from.index()]))
         .collect();
-    let more = steps.len().saturating_sub(MAX_STEPS_NAMED);
-    steps.truncate(MAX_STEPS_NAMED);
-    if more > 0 {
-        steps.push(format!("and {more} more"));
-    }
     Some(format!(
         "distances{} rest on what lies beside the points of one pair and on the floor, not on points that a third \
          image sees (± {least:.0} to {most:.0} %): {}",
         of_component(component),
-        steps.join(", ")
+        first_of(steps, MAX_STEPS_NAMED)
     ))
 }
 

@@ -20,22 +20,13 @@ impl BundleProblem {
     /// mean of the loss' curvatures along the residual and across it.
     pub fn reweighted(&self, loss: RobustLoss) -> Self {
         let mut weighted = self.clone();
-        let camera_point = |pose: u32, point: u32| {
-            let point = self.points.get(point as usize)?.position;
-            Some(self.poses.get(pose as usize)?.world_from_camera.inverse().transform_point(&point))
-        };
         for seen in &mut weighted.observations {
-            let whitened = || {
-                let camera = self.cameras.get(self.poses.get(seen.pose as usize)?.camera as usize)?;
-                let (bearing, inverse_sigma) = bearing_and_weight(camera, &seen.pixel, seen.noise_px)?;
-                Some(angular_squared(&bearing, &camera_point(seen.pose, seen.point)?) * inverse_sigma.powi(2))
-            };
-            if let Some(squared) = whitened() {
-                seen.noise_px /= loss.mean_curvature(squared).sqrt();
+            if let Some(sight) = self.sight(seen) {
+                seen.noise_px /= loss.mean_curvature(sight.squared).sqrt();
             }
         }
         for seen in &mut weighted.bearings {
-            if let Some(point) = camera_point(seen.pose, seen.point) {
+            if let Some(point) = self.in_camera(seen.pose, seen.point) {
                 let squared = angular_squared(&seen.bearing, &point) / seen.sigma.powi(2);
                 seen.sigma /= loss.mean_curvature(squared).sqrt();
             }
@@ -49,17 +40,37 @@ impl BundleProblem {
     /// They are r ρ′ / (ρ′ + sρ″), the residuals by a factor of at most ten: what is farther off hardly pulls.
     pub fn residuals_under(&self, loss: RobustLoss) -> Vec<Vector3<f64>> {
         let residual = |seen: &BundleObservation| {
-            let pose = self.poses.get(seen.pose as usize)?;
-            let camera = self.cameras.get(pose.camera as usize)?;
-            let (bearing, inverse_sigma) = bearing_and_weight(camera, &seen.pixel, seen.noise_px)?;
-            let point = self.points.get(seen.point as usize)?.position;
-            let expected = pose.world_from_camera.inverse().transform_point(&point);
-            let squared = angular_squared(&bearing, &expected) * inverse_sigma.powi(2);
+            let Sight { bearing, expected, squared } = self.sight(seen)?;
             let pull = loss.evaluate(squared).1 / loss.mean_curvature(squared);
             Some((bearing - expected.try_normalize(f64::MIN_POSITIVE)?) * pull.min(MAX_PULL))
         };
         self.observations.iter().map(|seen| residual(seen).unwrap_or_default()).collect()
     }
+
+    /// An observation at the current state; `None` where it cannot be used.
+    fn sight(&self, seen: &BundleObservation) -> Option<Sight> {
+        let camera = self.cameras.get(self.poses.get(seen.pose as usize)?.camera as usize)?;
+        let (bearing, inverse_sigma) = bearing_and_weight(camera, &seen.pixel, seen.noise_px)?;
+        let expected = self.in_camera(seen.pose, seen.point)?;
+        let squared = angular_squared(&bearing, &expected) * inverse_sigma.powi(2);
+        Some(Sight { bearing, expected, squared })
+    }
+
+    /// A point in the frame of a pose's camera.
+    fn in_camera(&self, pose: u32, point: u32) -> Option<Vector3<f64>> {
+        let point = self.points.get(point as usize)?.position;
+        Some(self.poses.get(pose as usize)?.world_from_camera.inverse().transform_point(&point))
+    }
+}
+
+/// What an observation shows beside what it ought to, in the camera's frame.
+struct Sight {
+    /// As seen, of unit length.
+    bearing: Vector3<f64>,
+    /// The point.
+    expected: Vector3<f64>,
+    /// Squared angle between them, in standard deviations.
+    squared: f64,
 }
 
 /// Takes one Gauss–Newton step of the squares, whatever becomes of the cost; false, and nothing is changed, where there is none.
