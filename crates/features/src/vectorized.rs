@@ -31,7 +31,8 @@ impl Level {
 
 /// Defines a function whose body is compiled once for each [`Level`].
 ///
-/// The body is ordinary Rust without fused operations or reassociation, so every level gives the same bits.
+/// The body is ordinary Rust without fused operations or reassociation, so every level gives the same bits. It should be
+/// `for` loops: what closures given to `map` or `sum` do may stay a call, compiled for the baseline.
 macro_rules! vectorized {
     ($(#[$doc:meta])* fn $name:ident($($argument:ident: $type:ty),* $(,)?) $(-> $result:ty)? $body:block) => {
         $(#[$doc])*

@@ -4,7 +4,7 @@ use std::ops::Range;
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::kernel::{TwoNearest, squared_distance};
+use super::kernel::TwoNearest;
 use super::{Match, Parts, collect, match_simulated, passes};
 use crate::vectorized::{Level, vectorized};
 use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Rays};
@@ -173,28 +173,27 @@ impl<'a> Search<'a> {
         let [(first, a), (second, b)] = &self.parts;
         let (queries, others) = (&first.1.bearings[a.clone()], &second.1.bearings[b.clone()]);
         let asked: Vec<u32> = (0..others.len() as u32).filter(|&at| of_second(at)).collect();
-        if asked.is_empty() {
-            return;
-        }
-        let bearings: Vec<Vector3<f64>> = asked.iter().map(|&at| others[at as usize]).collect();
-        let Some(sectors) = Sectors::new(&bearings, &self.second_from_first, self.max_angle_rad) else {
+        let Some(sectors) = Sectors::new(others, asked, &self.second_from_first, self.max_angle_rad) else {
             return;
         };
         let (level, max_sine) = (Level::detect(), self.max_angle_rad.sin());
         let base = &second.0.descriptors[b.start * DESCRIPTOR_LEN..b.end * DESCRIPTOR_LEN];
-        let (mut candidates, mut distances) = (Vec::new(), Vec::new());
+        let (mut sines, mut candidates, mut distances) = (Vec::new(), Vec::new(), Vec::new());
         for (at, bearing) in (0u32..).zip(queries).filter(|(at, _)| of_first(*at)) {
             let Some(plane) = (self.second_from_first * bearing).try_normalize(f64::EPSILON) else {
                 continue;
             };
-            // Keypoints without a ray have the zero vector, which lies in every plane.
-            let is_in_band = |candidate: &&u32| {
-                let bearing = &bearings[**candidate as usize];
-                bearing.dot(&plane).abs() <= max_sine && *bearing != Vector3::zeros()
-            };
+            let (members, bearings) = sectors.candidates(&plane);
+            sines_to_plane(level, bearings, &plane, &mut sines);
+            // Without a branch, which nobody could foresee.
             candidates.clear();
-            candidates
-                .extend(sectors.candidates(&plane).iter().filter(is_in_band).map(|&at| asked[at as usize]));
+            candidates.resize(members.len(), 0);
+            let mut found = 0;
+            for (&member, &sine) in members.iter().zip(&sines) {
+                candidates[found] = member;
+                found += usize::from(sine <= max_sine);
+            }
+            candidates.truncate(found);
             squared_distances(
                 level,
                 first.0.descriptor(a.start + at as usize),
@@ -214,28 +213,73 @@ impl<'a> Search<'a> {
     }
 }
 
+/// Bytes of a descriptor whose squares are summed side by side.
+const LANES: usize = 32;
+
 vectorized! {
     /// Squared distances of a descriptor from some of an image's.
     fn squared_distances(query: &[u8], base: &[u8], candidates: &[u32], distances: &mut Vec<u32>) {
         distances.clear();
+        distances.resize(candidates.len(), 0);
         // With lengths that are known the loop has no rest.
         let Some(query) = query.first_chunk::<DESCRIPTOR_LEN>() else { return };
         let (base, _) = base.as_chunks::<DESCRIPTOR_LEN>();
-        distances.extend(candidates.iter().map(|&candidate| squared_distance(query, &base[candidate as usize])));
+        for (distance2, &candidate) in distances.iter_mut().zip(candidates) {
+            let (query, _) = query.as_chunks::<LANES>();
+            let (candidate, _) = base[candidate as usize].as_chunks::<LANES>();
+            let mut sums = [0; LANES];
+            for (query, candidate) in query.iter().zip(candidate) {
+                for ((sum, &a), &b) in sums.iter_mut().zip(query).zip(candidate) {
+                    // Differences of 16 bits are what vector registers square.
+                    let difference = i32::from(i16::from(a) - i16::from(b));
+                    *sum += difference * difference;
+                }
+            }
+            let mut total = 0;
+            for sum in sums {
+                total += sum;
+            }
+            *distance2 = total as u32;
+        }
     }
 }
 
-/// The second image's keypoints by azimuth about its epipole: every epipolar plane contains the epipole, so the
+vectorized! {
+    /// Sines of the angles between bearings, by their coordinates, and a plane of unit normal.
+    fn sines_to_plane(bearings: [&[f64]; 3], normal: &Vector3<f64>, sines: &mut Vec<f64>) {
+        let [x, y, z] = bearings;
+        sines.clear();
+        sines.resize(x.len(), 0.0);
+        for (((sine, &x), &y), &z) in sines.iter_mut().zip(x).zip(y).zip(z) {
+            *sine = (x * normal.x + y * normal.y + z * normal.z).abs();
+        }
+    }
+}
+
+/// Some of the second image's keypoints by azimuth about its epipole: every epipolar plane contains the epipole, so the
 /// keypoints near one plane are those of nearly one azimuth (modulo π, a plane has two sides).
 struct Sectors {
     x_axis: Vector3<f64>,
     y_axis: Vector3<f64>,
+    /// The keypoints of all sectors, those of one in index order, and the coordinates of their bearings.
     members: Vec<u32>,
+    bearings: [Vec<f64>; 3],
     starts: Vec<usize>,
 }
 
 impl Sectors {
-    fn new(bearings: &[Vector3<f64>], second_from_first: &Matrix3<f64>, max_angle_rad: f64) -> Option<Self> {
+    /// Those of these keypoints that have a ray; `None` where there are none, or no epipole.
+    fn new(
+        bearings: &[Vector3<f64>],
+        mut keypoints: Vec<u32>,
+        second_from_first: &Matrix3<f64>,
+        max_angle_rad: f64,
+    ) -> Option<Self> {
+        // Keypoints without a ray have the zero vector, which lies in every plane.
+        keypoints.retain(|&keypoint| bearings[keypoint as usize] != Vector3::zeros());
+        if keypoints.is_empty() {
+            return None;
+        }
         let svd = second_from_first.transpose().svd(false, true);
         let v_t = svd.v_t?;
         let smallest = svd.singular_values.imin();
@@ -249,25 +293,24 @@ impl Sectors {
         // Sectors of about the band's width: narrower ones would only list each keypoint more often.
         let count = ((PI / (2.0 * max_angle_rad.max(1e-6))) as usize).clamp(1, MAX_SECTORS);
         let max_sine = max_angle_rad.sin();
-        let spans: Vec<(usize, usize)> = bearings
-            .iter()
-            .map(|bearing| {
-                let (x, y) = (bearing.dot(&x_axis), bearing.dot(&y_axis));
-                // sin(deviation) = sin(angle to the epipole) · sin(azimuth difference).
-                let sine = max_sine / x.hypot(y);
-                // A little wider, so that rounding never hides a candidate that the exact test accepts.
-                let half = if sine < 1.0 { sine.asin() + 1e-9 } else { FRAC_PI_2 };
-                if half >= FRAC_PI_2 {
-                    return (0, count);
-                }
-                let azimuth = y.atan2(x).rem_euclid(PI);
-                let width = PI / count as f64;
-                let begin = ((azimuth - half) / width).floor();
-                let end = ((azimuth + half) / width).floor();
-                let len = ((end - begin) as usize + 1).min(count);
-                (begin.rem_euclid(count as f64) as usize % count, len)
-            })
-            .collect();
+        let span = |keypoint: &u32| {
+            let bearing = &bearings[*keypoint as usize];
+            let (x, y) = (bearing.dot(&x_axis), bearing.dot(&y_axis));
+            // sin(deviation) = sin(angle to the epipole) · sin(azimuth difference).
+            let sine = max_sine / x.hypot(y);
+            // A little wider, so that rounding never hides a candidate that the exact test accepts.
+            let half = if sine < 1.0 { sine.asin() + 1e-9 } else { FRAC_PI_2 };
+            if half >= FRAC_PI_2 {
+                return (0, count);
+            }
+            let azimuth = y.atan2(x).rem_euclid(PI);
+            let width = PI / count as f64;
+            let begin = ((azimuth - half) / width).floor();
+            let end = ((azimuth + half) / width).floor();
+            let len = ((end - begin) as usize + 1).min(count);
+            (begin.rem_euclid(count as f64) as usize % count, len)
+        };
+        let spans: Vec<(usize, usize)> = keypoints.iter().map(span).collect();
         let mut starts = vec![0; count + 1];
         for &(begin, len) in &spans {
             (0..len).for_each(|step| starts[(begin + step) % count + 1] += 1);
@@ -277,23 +320,26 @@ impl Sectors {
         }
         let mut next = starts.clone();
         let mut members = vec![0; starts[count]];
-        for (index, &(begin, len)) in (0u32..).zip(&spans) {
+        for (&keypoint, &(begin, len)) in keypoints.iter().zip(&spans) {
             for step in 0..len {
                 let sector = (begin + step) % count;
-                members[next[sector]] = index;
+                members[next[sector]] = keypoint;
                 next[sector] += 1;
             }
         }
-        Some(Self { x_axis, y_axis, members, starts })
+        let bearings = [0, 1, 2]
+            .map(|axis: usize| members.iter().map(|&member| bearings[member as usize][axis]).collect());
+        Some(Self { x_axis, y_axis, members, bearings, starts })
     }
 
-    /// Keypoints that may lie in the band of the plane with this normal, in index order.
-    fn candidates(&self, plane: &Vector3<f64>) -> &[u32] {
+    /// Keypoints that may lie in the band of the plane with this normal, in index order, and their bearings.
+    fn candidates(&self, plane: &Vector3<f64>) -> (&[u32], [&[f64]; 3]) {
         // The plane's azimuth is a quarter turn from its normal's.
         let azimuth = plane.dot(&self.x_axis).atan2(-plane.dot(&self.y_axis)).rem_euclid(PI);
         let count = self.starts.len() - 1;
         let sector = ((azimuth / PI * count as f64) as usize).min(count - 1);
-        &self.members[self.starts[sector]..self.starts[sector + 1]]
+        let range = self.starts[sector]..self.starts[sector + 1];
+        (&self.members[range.clone()], [0, 1, 2].map(|axis: usize| &self.bearings[axis][range.clone()]))
     }
 }
 
@@ -305,6 +351,7 @@ mod tests {
 
     use super::*;
     use crate::Keypoint;
+    use crate::matching::squared_distance;
 
     struct Pair {
         first: (ImageFeatures, Rays),
@@ -355,10 +402,11 @@ mod tests {
         let pair = pair();
         for max_angle in [1e-4_f64, 0.01, 0.3, 1.5] {
             let bearings = &pair.second.1.bearings;
-            let sectors = Sectors::new(bearings, &pair.essential, max_angle).unwrap();
+            let all = (0..bearings.len() as u32).collect();
+            let sectors = Sectors::new(bearings, all, &pair.essential, max_angle).unwrap();
             for bearing in &pair.first.1.bearings {
                 let plane = (pair.essential * bearing).normalize();
-                let listed = sectors.candidates(&plane);
+                let (listed, _) = sectors.candidates(&plane);
                 for (index, other) in (0u32..).zip(bearings) {
                     if other.dot(&plane).abs() <= max_angle.sin() {
                         assert!(listed.contains(&index), "angle {max_angle}");
