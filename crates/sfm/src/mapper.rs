@@ -77,7 +77,7 @@ use self::{
 use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind};
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 47;
+pub const MAPPER_VERSION: u32 = 48;
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///
@@ -577,29 +577,39 @@ impl<'a> Mapper<'a> {
         Some(visibility(&self.model, image, &pose, &self.model.observations_of(image)))
     }
 
+    /// What an image sees of what it ought to, where it does not see that.
+    fn seen_if_misplaced(&self, image: ImageId) -> Option<Visibility> {
+        let pose = self.model.poses[image.index()]?.world_from_camera;
+        let observations = self.model.observations_of(image);
+        let seen = visibility(&self.model, image, &pose, &observations);
+        let judged = seen.expected >= self.params.min_visible_points;
+        let is_misplaced = match self.testimony(image, &pose, &observations) {
+            Some(testimony) => testimony.speaks_against(),
+            None => {
+                judged
+                    && !self.params.is_recognized(&seen)
+                    && !self.shares_as_neighbour(image, &pose)
+                    && !self.is_latecomer(image, &pose)
+                    && !self.hangs(image, &pose)
+            }
+        };
+        is_misplaced.then_some(seen)
+    }
+
     /// The place of the first of these images that does not see what it ought to.
     fn first_misplaced(&self, images: &[ImageId]) -> Option<(usize, Visibility)> {
         if self.model.registered_count() <= 3 {
             return None;
         }
-        let misplaced = |(at, &image): (usize, &ImageId)| {
-            let pose = self.model.poses[image.index()]?.world_from_camera;
-            let observations = self.model.observations_of(image);
-            let seen = visibility(&self.model, image, &pose, &observations);
-            let judged = seen.expected >= self.params.min_visible_points;
-            let is_misplaced = match self.testimony(image, &pose, &observations) {
-                Some(testimony) => testimony.speaks_against(),
-                None => {
-                    judged
-                        && !self.params.is_recognized(&seen)
-                        && !self.shares_as_neighbour(image, &pose)
-                        && !self.is_latecomer(image, &pose)
-                        && !self.hangs(image, &pose)
-                }
-            };
-            is_misplaced.then_some((at, seen))
-        };
+        let misplaced = |(at, &image): (usize, &ImageId)| Some((at, self.seen_if_misplaced(image)?));
         images.par_iter().with_max_len(1).enumerate().find_map_first(misplaced)
+    }
+
+    /// How many of these images do not see what they ought to.
+    fn misplaced_count(&self, images: impl Iterator<Item = ImageId>) -> usize {
+        let images: Vec<ImageId> = images.collect();
+        let is_misplaced = |image: &ImageId| self.seen_if_misplaced(*image).is_some();
+        images.into_par_iter().with_max_len(1).filter(is_misplaced).count()
     }
 
     fn adjust_all(&mut self, max_iterations: u32) {

@@ -77,8 +77,8 @@ impl MatchParams {
     /// 2: bright and dark spots apart, screened by the strongest. 3: simulated views. 4: which do not count among those
     /// that are worth screening. 5: without the last bit of descriptors; keypoints of level images that are turned alike.
     /// 6: small images are taken for level by their strongest keypoints, too. 7: keypoints of level images that can show the
-    /// same by height and size, too.
-    pub const VERSION: u32 = 8;
+    /// same by height and size, too. 9: these in simulated views as well.
+    pub const VERSION: u32 = 9;
 
     /// Checks the ranges.
     ///
@@ -180,7 +180,7 @@ impl Elevations {
 /// 45° from them, but all keypoints of the ground with each other, and all of ceilings. What is above one camera
 /// is not below the other; and how large a thing looks, relative to the sine of its elevation, is the same in both,
 /// so that keypoints up to 1.5 octaves apart in this are compared: a quarter of the work, and fewer to
-/// be confused with. Where the strongest keypoints match otherwise the images are not level, and all are compared.
+/// be confused with. All that is so in simulated views, which are squeezed along the horizon or across it. Where the strongest keypoints match otherwise the images are not level, and all are compared.
 ///
 /// Simulated views are matched one by one, each with the other image itself, so that a keypoint does not compete in
 /// the ratio test with its own likes of other views. Of matches that say the same (both ends within
@@ -203,12 +203,20 @@ pub fn match_features(
         }
         strongest = Some(found);
     }
-    let own = without_carried(match_own(params, posture, first, second, strongest), posture, first, second);
+    let level = level_of(params, posture, first, second, strongest);
+    let of_parts = |a: Parts, b: Parts| match level {
+        Some(elevations) => {
+            let of_part =
+                |(a, b)| alike::match_parts(params, (first, a, elevations[0]), (second, b, elevations[1]));
+            a.into_iter().zip(b).flat_map(of_part).collect()
+        }
+        None => match_all(params, (first, a), (second, b)),
+    };
+    let own = without_carried(of_parts(first.parts(), second.parts()), posture, first, second);
     if own.len() >= params.simulate_below || (first.simulated.is_empty() && second.simulated.is_empty()) {
         return own;
     }
-    let all = match_simulated(first, second, own, |a, b| match_all(params, (first, a), (second, b)));
-    without_carried(all, posture, first, second)
+    without_carried(match_simulated(first, second, own, of_parts), posture, first, second)
 }
 
 /// Matches of two images without those of what moves with the camera.
@@ -224,27 +232,18 @@ pub fn without_carried(
     }
 }
 
-/// Matches two images themselves; `strongest` are matches of their strongest keypoints, if there are more.
-fn match_own(
+/// The elevations of two images' rows where the images are level: told so, and not contradicted by their strongest keypoints,
+/// whose matches are `strongest` if they are known.
+fn level_of(
     params: &MatchParams,
     posture: Posture,
     first: &ImageFeatures,
     second: &ImageFeatures,
     strongest: Option<Vec<Match>>,
-) -> Vec<Match> {
-    let all = || match_all(params, (first, first.parts()), (second, second.parts()));
-    let Posture::Level(elevations) = posture else {
-        return all();
-    };
+) -> Option<[Elevations; 2]> {
+    let Posture::Level(elevations) = posture else { return None };
     let sample = strongest.unwrap_or_else(|| match_strongest(params, alike::SAMPLE, first, second));
-    if alike::contradict(&sample, elevations, first, second) {
-        return all();
-    }
-    let of_parts = first.parts().into_iter().zip(second.parts());
-    let alike_in = |(of_first, of_second)| {
-        alike::match_parts(params, (first, of_first, elevations[0]), (second, of_second, elevations[1]))
-    };
-    of_parts.flat_map(alike_in).collect()
+    (!alike::contradict(&sample, elevations, first, second)).then_some(elevations)
 }
 
 /// Matches so many bright and so many dark keypoints of each image, the strongest.

@@ -147,6 +147,8 @@ const SAME_PLACE: f64 = 0.2;
 const MAX_POSITION_ERROR_M: f64 = 15.0;
 /// The same as a share of the measured distance.
 const MAX_POSITION_ERROR_SHARE: f64 = 0.3;
+/// One in so many images of a component may not fit the whole: it may have come in wrongly, at the component's end say.
+const UNFIT_ONE_IN: usize = 8;
 /// Smallest share of each component's own observations that the adjustment of both together must keep.
 const MIN_KEPT_OBSERVATIONS: f64 = 0.9;
 
@@ -661,7 +663,11 @@ impl<'a> Attempt<'_, '_, 'a> {
         mapper.replace_misplaced();
         // Where a part ends an image may have come in askew by a few points, which the other part has hundreds of matches with.
         let may_leave = |part: &Part, image| belongs_elsewhere(mapper.model.input, part, image);
-        self.keeps_images(&mapper, may_leave).then_some(mapper)
+        let num_lost = |of: &Part| {
+            let images = of.component.registered();
+            images.filter(|image| !mapper.model.is_registered(*image) && !may_leave(of, *image)).count()
+        };
+        self.fit_but_few([self.kept, self.moved].map(num_lost)).then_some(mapper)
     }
 
     /// The model of both, that images may join but those that are taken.
@@ -678,12 +684,16 @@ impl<'a> Attempt<'_, '_, 'a> {
         mapper
     }
 
-    /// Whether all images of both are still in the whole, but for those that may leave their part.
-    fn keeps_images(&self, mapper: &Mapper<'_>, may_leave: impl Fn(&Part, ImageId) -> bool) -> bool {
-        [self.kept, self.moved].into_iter().all(|part| {
-            let mut images = part.component.registered();
-            images.all(|image| mapper.model.is_registered(image) || may_leave(part, image))
-        })
+    /// Whether so few images of the kept and the moved part do not fit the whole that it may be their own fault.
+    fn fit_but_few(&self, num_unfit: [usize; 2]) -> bool {
+        let parts = [self.kept, self.moved];
+        parts.into_iter().zip(num_unfit).all(|(part, unfit)| unfit * UNFIT_ONE_IN <= part.size())
+    }
+
+    /// Whether all images of both are in the whole.
+    fn keeps_images(&self, mapper: &Mapper<'_>) -> bool {
+        let mut images = [self.kept, self.moved].into_iter().flat_map(|part| part.component.registered());
+        images.all(|image| mapper.model.is_registered(image))
     }
 
     /// Whether the adjusted whole keeps what either component saw.
@@ -705,7 +715,6 @@ impl<'a> Attempt<'_, '_, 'a> {
                 sides.iter().all(|side| point.track.iter().any(|seen| side.is_registered(seen.image)))
             })
             .count();
-        let all: Vec<ImageId> = model.registered().collect();
         let recognizes = |of: &Model<'_>, at: &Model<'_>| {
             let seen: Visibility = of
                 .registered()
@@ -724,7 +733,7 @@ impl<'a> Attempt<'_, '_, 'a> {
         self.keeps_points(model)
             && ties >= self.params.min_registration_inliers
             && !self.is_contradicted(model)
-            && mapper.first_misplaced(&all).is_none()
+            && self.fit_but_few(sides.map(|side| mapper.misplaced_count(side.registered())))
             && (recognized() || self.share_as_neighbours(pose))
     }
 

@@ -161,6 +161,6 @@ impl<'a> Attempt<'_, '_, 'a> {
         }
         mapper.grow();
         mapper.finish();
-        self.keeps_images(&mapper, |_, _| false).then_some(mapper)
+        self.keeps_images(&mapper).then_some(mapper)
     }
 }
