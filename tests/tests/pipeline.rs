@@ -9,7 +9,7 @@ use std::sync::atomic::AtomicBool;
 use setloc_camset::{PhotoLocalization, Verdict};
 use setloc_features::Calibration;
 use setloc_orchestrator::bench::{BenchGps, BenchOptions, DatasetFigures, bench_dataset};
-use setloc_orchestrator::building::{BuildOutcome, Built, build_scene};
+use setloc_orchestrator::building::{BuildOutcome, Built, SceneSource, build_scene};
 use setloc_orchestrator::config::Config;
 use setloc_orchestrator::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use setloc_orchestrator::jobs::LocateJobs;
@@ -35,7 +35,8 @@ fn session(store: &Path) -> Session {
 }
 
 fn built(session: &Session, panoramas: &ImageFolder, config: &Config) -> Box<Built> {
-    match build_scene(session, panoramas, config, 0, "scene", None, |_| Ok(())).unwrap() {
+    let source = SceneSource { folder: panoramas, config, seed: 0, name: "scene", present: None };
+    match build_scene(session, source, |_| Ok(())).unwrap() {
         BuildOutcome::Built(built) => built,
         BuildOutcome::Unchanged(..) => panic!("no present hash was given"),
     }
@@ -244,6 +245,8 @@ fn photos_between_panoramas_that_share_little_are_placed_by_what_each_shows() {
     let refined = |max_images: usize| {
         let mut config = Config::default();
         config.camset.views.max_images = max_images;
+        // With one the panoramas share enough.
+        config.second_look.enabled = false;
         let mut figures = bench_with(folder.path(), config);
         figures.sets[0].methods.remove("camset+opt").unwrap()
     };

@@ -109,11 +109,30 @@ pub struct VerifiedPair(pub Vec<TwoView>);
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct LikelyImages(pub Vec<Vec<u32>>);
 
+/// Which images a model leaves out of its largest component.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct LeftApart {
+    /// Their places in the list of the model's images.
+    pub images: Vec<u32>,
+    /// Pairs of images of which the model tells the relative pose: those of one component.
+    pub known_pairs: u64,
+    /// All pairs of images.
+    pub pairs: u64,
+}
+
+impl LeftApart {
+    /// Whether the model tells less than half of what it could.
+    pub fn is_torn(&self) -> bool {
+        2 * self.known_pairs < self.pairs
+    }
+}
+
 /// The index of each component, the largest first.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SceneIndices(pub Vec<SceneIndex>);
 
 serde_artifact!(LikelyImages, "likely images", 1);
+serde_artifact!(LeftApart, "images left apart", 1);
 serde_artifact!(VerifiedPair, "verified pair", 1);
 serde_artifact!(MapperOutput, "model", 8);
 serde_artifact!(SceneIndices, "index", 2);

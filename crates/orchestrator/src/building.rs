@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use setloc_features::{Calibration, Camera, ImageFeatures};
 use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
 
-use crate::artifacts::LikelyImages;
+use crate::artifacts::{LeftApart, LikelyImages};
 use crate::config::Config;
 use crate::dataset::{ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::error::Hinted;
@@ -46,10 +46,29 @@ pub enum BuildOutcome {
     Built(Box<Built>),
 }
 
+/// What a scene is built from, and how.
+#[derive(Clone, Copy)]
+pub struct SceneSource<'a> {
+    /// The images.
+    pub folder: &'a ImageFolder,
+    /// All parameters.
+    pub config: &'a Config,
+    /// Seed of what is drawn.
+    pub seed: u64,
+    /// What the run is remembered by.
+    pub name: &'a str,
+    /// The hash of the scene that the output already has, which is not read if it is the result.
+    pub present: Option<ContentHash>,
+}
+
 /// Builds a scene; with the hash that the output already has, an unchanged scene is not read.
 ///
 /// Where intrinsics are a guess, the images are mapped twice: the second time their pairs are verified, and the model is
 /// begun, with the cameras that the first model told.
+///
+/// Where the model is torn, which tells less than half of the images' relative poses, those that it leaves out of its largest
+/// component are looked at once more ([`Config::second_features`]), and the scene is mapped again. Of the two models that
+/// stays which tells more, the first if both tell as much.
 ///
 /// `export` gets the scene while its last results are still being kept.
 ///
@@ -57,33 +76,104 @@ pub enum BuildOutcome {
 /// When no image is usable, the run was stopped or the store cannot be written; or as `export` does.
 pub fn build_scene(
     session: &Session,
-    folder: &ImageFolder,
-    config: &Config,
-    seed: u64,
-    name: &str,
-    present: Option<ContentHash>,
-    export: impl FnOnce(&Built) -> Result<()>,
+    source: SceneSource<'_>,
+    export: impl FnMut(&Built) -> Result<()>,
 ) -> Result<BuildOutcome> {
+    let SceneSource { folder, config, seed, name, .. } = source;
     let (alike, before) = alike_pairs(session, name, &folder.images, &config.features, config)?;
     let (calibrated, first) = estimate_cameras(session, name, &folder.images, &alike, config, seed)?;
-    let before = before.and(first);
-    let mut graph = JobGraph::default();
     let images = calibrated.as_deref().unwrap_or(&folder.images);
-    let jobs = add_scene(&mut graph, images, &alike, config, seed)?;
-    graph.want(jobs.scene);
-    graph.want_file(jobs.scene);
-    jobs.features.iter().for_each(|features| graph.want(*features));
-    let use_results = |executor: &Executor<'_>, run: &RunResult| {
-        let run = &before.clone().and(run.clone());
-        let outcome = outcome_of(executor, &graph, &jobs, folder, run, present)?;
-        if let BuildOutcome::Built(built) = &outcome {
-            export(built)?;
-        }
-        Ok(outcome)
-    };
-    let (run, outcome) = session.run_with(name, &graph, use_results)?;
-    session.remember(name, &before.and(run));
-    outcome
+    let mut passes = Passes { session, source, alike: &alike, run: before.and(first), export };
+    let mut pass = passes.pass(images, |left| !(config.second_look.enabled && left.is_torn()))?;
+    if let Pass::Left(first, again) = &pass {
+        session.note(format!(
+            "{} of {} images are apart from the largest component and looked at once more (second_look)",
+            first.images.len(),
+            images.len()
+        ));
+        pass = passes.pass(again, |second| second.known_pairs > first.known_pairs)?;
+    }
+    if let Pass::Left(..) = pass {
+        session.note("no more images came together by that, and the first model stays".to_owned());
+        // All of it is stored.
+        pass = passes.pass(images, |_| true)?;
+    }
+    session.remember(name, &passes.run);
+    match pass {
+        Pass::Done(outcome) => Ok(outcome),
+        Pass::Left(..) => anyhow::bail!("the last pass did not stay: this is a bug"),
+    }
+}
+
+/// The passes that a scene is built in.
+struct Passes<'a, Export> {
+    session: &'a Session,
+    source: SceneSource<'a>,
+    alike: &'a [(usize, usize)],
+    /// What ran so far.
+    run: RunResult,
+    /// Called with the scene that stays.
+    export: Export,
+}
+
+/// What a pass came to.
+enum Pass {
+    /// Its scene stays.
+    Done(BuildOutcome),
+    /// What its model leaves apart, and the images for another pass.
+    Left(LeftApart, Vec<SourceImage>),
+}
+
+impl<Export: FnMut(&Built) -> Result<()>> Passes<'_, Export> {
+    /// Builds a scene of these images, which stays if what its model leaves apart is such.
+    fn pass(&mut self, images: &[SourceImage], stays: impl FnOnce(&LeftApart) -> bool) -> Result<Pass> {
+        let SceneSource { folder, config, seed, name, present } = self.source;
+        let mut graph = JobGraph::default();
+        let jobs = add_scene(&mut graph, images, self.alike, config, seed)?;
+        graph.want(jobs.scene);
+        graph.want_file(jobs.scene);
+        graph.want(jobs.left_apart);
+        jobs.features.iter().for_each(|features| graph.want(*features));
+        let (before, export) = (&self.run, &mut self.export);
+        let use_results = |executor: &Executor<'_>, run: &RunResult| {
+            if let Some(left) = executor.load_made::<LeftApart>(jobs.left_apart)?.filter(|left| !stays(left))
+            {
+                let again = jobs.looked_at_again(images, &left);
+                return Ok(Pass::Left((*left).clone(), again));
+            }
+            let run = &before.clone().and(run.clone());
+            let outcome = outcome_of(executor, &graph, &jobs, folder, run, present)?;
+            if let BuildOutcome::Built(built) = &outcome {
+                export(built)?;
+            }
+            Ok(Pass::Done(outcome))
+        };
+        let (run, pass) = self.session.run_with(name, &graph, use_results)?;
+        self.run.absorb(run);
+        pass
+    }
+}
+
+/// The images of a scene's second pass, `None` where its model is not torn; what that takes is read where it is stored.
+///
+/// # Errors
+/// When the run was stopped or the store cannot be written.
+pub fn images_of_second_pass(
+    session: &Session,
+    name: &str,
+    images: &[SourceImage],
+    alike: &[(usize, usize)],
+    config: &Config,
+    seed: u64,
+) -> Result<Option<Vec<SourceImage>>> {
+    let mut graph = JobGraph::default();
+    let jobs = add_scene(&mut graph, images, alike, config, seed)?;
+    graph.want(jobs.left_apart);
+    session.run(name, &graph, |executor, _| {
+        let left = executor.load_made::<LeftApart>(jobs.left_apart)?;
+        let left = left.filter(|left| config.second_look.enabled && left.is_torn());
+        Ok(left.map(|left| jobs.looked_at_again(images, &left)))
+    })
 }
 
 /// Pairs of images that look alike, where pairs cannot be chosen without, and what finding them took.

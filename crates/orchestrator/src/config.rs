@@ -21,6 +21,8 @@ pub struct Config {
     pub features: FeatureParams,
     /// Where the features of query photos differ from the scene's.
     pub photos: PhotoParams,
+    /// Where the features of images differ that a first model of the scene leaves apart.
+    pub second_look: SecondLookParams,
     /// Which pairs are matched.
     pub pairs: PairParams,
     /// Two-nearest-neighbour matching.
@@ -62,6 +64,25 @@ impl Default for PhotoParams {
     }
 }
 
+/// Where the features of images differ that a first model of the scene leaves out of its largest component.
+///
+/// What holds these back is mostly that no third image shares what two of them do. More features cost time, and are
+/// sought where the first model shows that they are wanted: where it tells less than half of the images' relative poses.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SecondLookParams {
+    /// Whether there is a second look.
+    pub enabled: bool,
+    /// In place of `features.simulated_tilt`, where it is the larger.
+    pub simulated_tilt: f64,
+}
+
+impl Default for SecondLookParams {
+    fn default() -> Self {
+        Self { enabled: true, simulated_tilt: 2.0 }
+    }
+}
+
 /// Which pairs of images are matched.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -86,6 +107,14 @@ impl Config {
     /// How features of query photos are extracted.
     pub fn photo_features(&self) -> FeatureParams {
         FeatureParams { simulated_tilt: self.photos.simulated_tilt, ..self.features.clone() }
+    }
+
+    /// How features of images are extracted that a first model of the scene leaves apart.
+    pub fn second_features(&self) -> FeatureParams {
+        FeatureParams {
+            simulated_tilt: self.features.simulated_tilt.max(self.second_look.simulated_tilt),
+            ..self.features.clone()
+        }
     }
 
     /// Defaults, then the file, then `key=value` settings such as `two_view.min_inliers=30`.

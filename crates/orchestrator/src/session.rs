@@ -100,6 +100,11 @@ impl Session {
         run
     }
 
+    /// Tells a person something.
+    pub fn note(&self, text: String) {
+        self.observer.notice(&Event::Note { text });
+    }
+
     /// Remembers a run under a name, for `plan`, `explain` and `status`; that it cannot is a warning, since its results are
     /// there.
     pub fn remember(&self, name: &str, run: &RunResult) {

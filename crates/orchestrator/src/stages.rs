@@ -16,6 +16,8 @@ pub const FEATURES_VERSION: u32 = FeatureParams::VERSION;
 pub const MATCHING_VERSION: u32 = MatchParams::VERSION;
 /// Version of the comparison of all images by their strongest keypoints.
 pub const LIKELY_VERSION: u32 = 1;
+/// Version of what is said of a model's components.
+pub const LEFT_APART_VERSION: u32 = 1;
 /// Version of two-view verification.
 pub const VERIFY_VERSION: u32 = setloc_sfm::TWO_VIEW_VERSION;
 /// Version of mapping.

@@ -9,21 +9,24 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use setloc_orchestrator::building::{BuildOutcome, Built, build_scene};
-use setloc_orchestrator::config::{Config, PairParams};
+use setloc_features::FeatureParams;
+use setloc_orchestrator::building::{BuildOutcome, Built, SceneSource, build_scene};
+use setloc_orchestrator::config::{Config, PairParams, SecondLookParams};
 use setloc_orchestrator::dataset::{CameraBook, GeoSource, ImageFolder, list_images};
 use setloc_orchestrator::jobs::LocateJobs;
 use setloc_orchestrator::locating::{Mode, locate};
 use setloc_orchestrator::session::{Limits, Session};
+use setloc_town::TownParams;
 
-use common::{files_below, logged, panoramas, program, said, setloc, town, write_picture};
+use common::{files_below, logged, panoramas, program, said, setloc, small_town, town, write_picture};
 
 fn build(store: &Path, panoramas: &Path, config: &Config) -> Box<Built> {
     let limits = Limits { threads: 2, memory: 1 << 30 };
     let session = Session::open(store, None, limits, Arc::new(AtomicBool::new(false))).unwrap();
     let files = list_images(&[panoramas.to_owned()]).unwrap();
     let folder = ImageFolder::read(&files, &CameraBook::default(), &GeoSource::None, None).unwrap();
-    match build_scene(&session, &folder, config, 7, "test", None, |_| Ok(())).unwrap() {
+    let source = SceneSource { folder: &folder, config, seed: 7, name: "test", present: None };
+    match build_scene(&session, source, |_| Ok(())).unwrap() {
         BuildOutcome::Built(built) => built,
         BuildOutcome::Unchanged(..) => panic!("no present hash was given"),
     }
@@ -33,12 +36,18 @@ fn ran<'b>(built: &'b Built, kind: &str) -> Vec<&'b str> {
     built.run.ran.iter().filter_map(|job| job.strip_prefix(kind)?.strip_prefix(' ')).collect()
 }
 
+/// Pictures that show nothing in common would be looked at twice.
+fn one_pass() -> Config {
+    let second_look = SecondLookParams { enabled: false, ..SecondLookParams::default() };
+    Config { second_look, ..Config::default() }
+}
+
 #[test]
 fn second_run_does_no_work_and_gives_the_same_scene() {
     let folder = tempfile::tempdir().unwrap();
     let images = panoramas(folder.path(), 4);
-    let first = build(&folder.path().join("store"), &images, &Config::default());
-    let second = build(&folder.path().join("store"), &images, &Config::default());
+    let first = build(&folder.path().join("store"), &images, &one_pass());
+    let second = build(&folder.path().join("store"), &images, &one_pass());
     assert_eq!(ran(&first, "features").len(), 4);
     assert!(second.run.ran.is_empty(), "{:?}", second.run.ran);
     assert_eq!(first.hash, second.hash);
@@ -48,8 +57,8 @@ fn second_run_does_no_work_and_gives_the_same_scene() {
 fn a_changed_parameter_runs_only_what_depends_on_it() {
     let folder = tempfile::tempdir().unwrap();
     let (images, store) = (panoramas(folder.path(), 3), folder.path().join("store"));
-    build(&store, &images, &Config::default());
-    let mut config = Config::default();
+    build(&store, &images, &one_pass());
+    let mut config = one_pass();
     config.two_view.min_inliers += 5;
     let built = build(&store, &images, &config);
     assert!(ran(&built, "features").is_empty() && ran(&built, "matches").is_empty(), "{:?}", built.run.ran);
@@ -63,7 +72,7 @@ fn images_that_look_alike_are_matched_whatever_they_are_called() {
     let folder = tempfile::tempdir().unwrap();
     let (images, store) = (panoramas(folder.path(), 4), folder.path().join("store"));
     let pairs = PairParams { exhaustive_up_to: 2, window: 0, nearest: 0, alike: 3 };
-    let mut config = Config { pairs, ..Config::default() };
+    let mut config = Config { pairs, ..one_pass() };
     let first = build(&store, &images, &config);
     assert_eq!((ran(&first, "features").len(), ran(&first, "likely").len()), (4, 1), "{:?}", first.run.ran);
     assert_eq!((ran(&first, "matches").len(), first.run.hits), (6, 0), "{:?}", first.run.ran);
@@ -83,6 +92,37 @@ fn images_that_look_alike_are_matched_whatever_they_are_called() {
     assert!(ran(&without, "matches").is_empty() && without.scene.main().is_none());
 }
 
+#[test]
+fn a_torn_scene_is_looked_at_once_more() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = folder.path().join("store");
+    let street = TownParams { panoramas: 5, panorama_step_m: 7.0, seed: 2, ..small_town() };
+    setloc_town::write_dataset(&folder.path().join("town"), &street, 92).unwrap();
+    let panoramas = folder.path().join("town/panoramas");
+    let few = FeatureParams { max_features: 400, min_features: 0, ..FeatureParams::default() };
+    let once = build(&store, &panoramas, &Config { features: few.clone(), ..one_pass() });
+    let registered = |built: &Built| built.scene.main().map_or(0, |model| model.registered().count());
+    assert!(registered(&once) < 3, "the scene must be torn for this test to say anything");
+    let config = Config { features: few, ..Config::default() };
+    let twice = build(&store, &panoramas, &config);
+    assert!(registered(&twice) >= 3, "{}", registered(&twice));
+    assert!(build(&store, &panoramas, &config).run.ran.is_empty());
+}
+
+#[test]
+fn the_first_model_stays_where_a_second_look_tells_no_more() {
+    let folder = tempfile::tempdir().unwrap();
+    let (images, store) = (panoramas(folder.path(), 4), folder.path().join("store"));
+    let first = build(&store, &images, &Config::default());
+    assert_eq!(ran(&first, "features").len(), 8, "{:?}", first.run.ran);
+    let again = build(&store, &images, &Config::default());
+    assert!(again.run.ran.is_empty() && again.hash == first.hash, "{:?}", again.run.ran);
+    let once = build(&store, &images, &one_pass());
+    let kinds: BTreeSet<&str> = once.run.ran.iter().filter_map(|label| label.split(' ').next()).collect();
+    // The scene file names its configuration.
+    assert_eq!(kinds, BTreeSet::from(["scene"]), "{:?}", once.run.ran);
+}
+
 /// Builds the town's scene and locates its set in it; the labels of the jobs that ran.
 fn build_and_locate(folder: &Path, config: &Config) -> Vec<String> {
     let (town, log) = (folder.join("town"), folder.join("run.jsonl"));
@@ -94,8 +134,9 @@ fn build_and_locate(folder: &Path, config: &Config) -> Vec<String> {
         let files = list_images(&[town.join(part)]).unwrap();
         ImageFolder::read(&files, &cameras, &GeoSource::None, None).unwrap()
     };
-    let built = match build_scene(&session, &read("panoramas"), config, 7, "scene", None, |_| Ok(())).unwrap()
-    {
+    let folder = read("panoramas");
+    let source = SceneSource { folder: &folder, config, seed: 7, name: "scene", present: None };
+    let built = match build_scene(&session, source, |_| Ok(())).unwrap() {
         BuildOutcome::Built(built) => built,
         BuildOutcome::Unchanged(..) => panic!("no present hash was given"),
     };
@@ -122,6 +163,7 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
         "camset",
         "features",
         "index",
+        "left_apart",
         "local_model",
         "matches",
         "model",
@@ -140,7 +182,16 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
     let bundle = after(&["sfm.loss_sigma=1.5"]);
     assert_eq!(
         kinds(&bundle),
-        BTreeSet::from(["model", "aligned", "local_model", "index", "scene", "single", "camset"])
+        BTreeSet::from([
+            "model",
+            "aligned",
+            "left_apart",
+            "local_model",
+            "index",
+            "scene",
+            "single",
+            "camset"
+        ])
     );
     let features = after(&["features.max_features=300"]);
     assert_eq!(kinds(&features), BTreeSet::from(all));
@@ -151,9 +202,9 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
 fn a_replaced_panorama_redoes_its_own_features_and_pairs_only() {
     let folder = tempfile::tempdir().unwrap();
     let (images, store) = (panoramas(folder.path(), 4), folder.path().join("store"));
-    build(&store, &images, &Config::default());
+    build(&store, &images, &one_pass());
     write_picture(&images.join("p2.png"), 99);
-    let built = build(&store, &images, &Config::default());
+    let built = build(&store, &images, &one_pass());
     assert_eq!(ran(&built, "features"), ["panoramas/p2.png"]);
     let foreign = |job: &&str| !job.contains("panoramas/p2.png");
     assert!(!ran(&built, "matches").iter().any(foreign), "{:?}", built.run.ran);
@@ -201,7 +252,7 @@ fn a_changed_folder_of_panoramas_runs_exactly_what_follows() {
     let mut job_lists = Vec::new();
     let mut step = |change: &dyn Fn()| {
         change();
-        job_lists.push(build(&store, &images, &Config::default()).run.ran);
+        job_lists.push(build(&store, &images, &one_pass()).run.ran);
     };
     let (aside, path) = (folder.path().join("aside.jpg"), |name: &str| images.join(name));
     step(&|| std::fs::rename(path(last), &aside).unwrap());
@@ -217,7 +268,10 @@ fn a_changed_folder_of_panoramas_runs_exactly_what_follows() {
         let pair = |kind: &str, other: &String| format!("{kind} panoramas/{other} panoramas/{new}");
         let mut jobs = vec![format!("features panoramas/{new}")];
         jobs.extend(others.iter().flat_map(|other| [pair("matches", other), pair("verify", other)]));
-        jobs.extend(["model scene", "aligned scene", "index scene", "scene scene"].map(str::to_owned));
+        jobs.extend(
+            ["model scene", "aligned scene", "index scene", "left_apart scene", "scene scene"]
+                .map(str::to_owned),
+        );
         jobs.sort();
         jobs
     };
@@ -225,7 +279,7 @@ fn a_changed_folder_of_panoramas_runs_exactly_what_follows() {
     assert_eq!(*added, pairs_of(last, others));
     assert_eq!(*replaced, pairs_of(last, others));
     assert_eq!(*renamed, ["scene scene"]);
-    assert_eq!(*removed, ["aligned scene", "index scene", "model scene", "scene scene"]);
+    assert_eq!(*removed, ["aligned scene", "index scene", "left_apart scene", "model scene", "scene scene"]);
 }
 
 #[test]

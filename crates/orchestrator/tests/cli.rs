@@ -204,7 +204,7 @@ fn plan_and_explain_name_the_parameter_that_changed() {
     assert!(run(&plan, &[]).contains("runs     features panoramas/pano_000.jpg: never ran before"));
     assert!(!folder.path().join(".setloc-cache").exists(), "a plan makes nothing");
     run(&build, &[]);
-    assert!(run(&plan, &[]).ends_with("0 jobs run, 0 depend on them, 20 are stored\n"));
+    assert!(run(&plan, &[]).ends_with("0 jobs run, 0 depend on them, 21 are stored\n"));
     let changed = ["--set", "two_view.min_inliers=40"];
     let reason = "parameter two_view.min_inliers changed from ";
     let planned = run(&plan, &changed);

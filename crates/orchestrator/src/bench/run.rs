@@ -12,7 +12,7 @@ use super::{
     AUC_THRESHOLDS_DEG, Alignment, Bounds, Calibration, Errors, NormalizedError, PoseError, SceneFigures,
     auc_percent,
 };
-use crate::building::{BuildOutcome, Built, build_scene};
+use crate::building::{BuildOutcome, Built, SceneSource, build_scene};
 use crate::config::Config;
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, SkippedImage, Truth, list_images};
 use crate::error::Hinted;
@@ -149,15 +149,14 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     let files = list_below(root, &root.join(kind))?;
     let run_name = |folder: &Path| session.store.name_of("bench", folder);
     let folder = ImageFolder::read(&files, &cameras, &geo, None)?;
-    let built = match build_scene(
-        session,
-        &folder,
-        &options.config,
-        options.seed,
-        &run_name(&root.join(kind)),
-        None,
-        |_| Ok(()),
-    )? {
+    let source = SceneSource {
+        folder: &folder,
+        config: &options.config,
+        seed: options.seed,
+        name: &run_name(&root.join(kind)),
+        present: None,
+    };
+    let built = match build_scene(session, source, |_| Ok(()))? {
         BuildOutcome::Built(built) => *built,
         BuildOutcome::Unchanged(..) => anyhow::bail!("the scene was not read: this is a bug"),
     };

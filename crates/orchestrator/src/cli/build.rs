@@ -11,7 +11,10 @@ use setloc_sfm::{ImageId, Reconstruction};
 use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
 use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
-use crate::building::{BuildOutcome, Built, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras};
+use crate::building::{
+    BuildOutcome, Built, SceneSource, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras,
+    images_of_second_pass,
+};
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, unread_images};
 use crate::error::Hinted;
@@ -56,7 +59,8 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
         scene.and(models)
     };
     let seed = args.source.run.seed;
-    let outcome = build_scene(&session, &folder, &config, seed, &name, present, write)?;
+    let source = SceneSource { folder: &folder, config: &config, seed, name: &name, present };
+    let outcome = build_scene(&session, source, write)?;
     let (scene, run, skipped, is_new) = match outcome {
         BuildOutcome::Unchanged(run, skipped, warnings) => {
             add_warnings(&mut folder, warnings);
@@ -158,7 +162,7 @@ fn stored_alike_pairs(
 }
 
 /// The jobs of the scene; where its cameras are a guess, those of the model that tells them as long as some of these are not
-/// stored.
+/// stored. Where all are, and its model leaves images apart, those of the second pass.
 fn next_jobs<'g>(
     args: &PlanArgs,
     folder: &ImageFolder,
@@ -167,20 +171,27 @@ fn next_jobs<'g>(
     (store, name): (&Store, &str),
 ) -> Result<JobGraph<'g>> {
     let seed = args.source.run.seed;
-    let mut graph = JobGraph::default();
-    if !has_guessed_cameras(&folder.images) {
-        add_scene(&mut graph, &folder.images, alike, config, seed)?;
-        return Ok(graph);
+    let session = || args.source.run.session(&args.source.output, None);
+    let mut told = None;
+    if has_guessed_cameras(&folder.images) {
+        let mut graph = JobGraph::default();
+        add_first_model(&mut graph, &folder.images, alike, config, seed)?;
+        if !is_stored(&graph, store) {
+            print::note("cameras are estimated by a first model, and what follows from them is not listed");
+            return Ok(graph);
+        }
+        told = estimate_cameras(&session()?, name, &folder.images, alike, config, seed)?.0;
     }
-    add_first_model(&mut graph, &folder.images, alike, config, seed)?;
-    if !is_stored(&graph, store) {
-        print::note("cameras are estimated by a first model, and what follows from them is not listed");
-        return Ok(graph);
-    }
-    let session = args.source.run.session(&args.source.output, None)?;
-    let (told, _) = estimate_cameras(&session, name, &folder.images, alike, config, seed)?;
+    let images = told.as_deref().unwrap_or(&folder.images);
     let mut graph = JobGraph::default();
-    add_scene(&mut graph, told.as_deref().unwrap_or(&folder.images), alike, config, seed)?;
+    add_scene(&mut graph, images, alike, config, seed)?;
+    if config.second_look.enabled && is_stored(&graph, store) {
+        let again = images_of_second_pass(&session()?, name, images, alike, config, seed)?;
+        if let Some(again) = again {
+            graph = JobGraph::default();
+            add_scene(&mut graph, &again, alike, config, seed)?;
+        }
+    }
     Ok(graph)
 }
 

@@ -33,6 +33,8 @@ pub struct SourceImage {
     pub position: Option<GeoPosition>,
     /// Mask image.
     pub mask: Option<(PathBuf, ContentHash)>,
+    /// Whether a first model of the scene left it apart, so that more features are sought in it.
+    pub second_look: bool,
 }
 
 #[cfg(test)]
@@ -48,6 +50,7 @@ impl SourceImage {
             camera_origin: CameraOrigin::Listed,
             position: None,
             mask: None,
+            second_look: false,
         }
     }
 }
@@ -290,6 +293,7 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
         camera_origin,
         position,
         mask: None,
+        second_look: false,
     })
 }
 

@@ -68,6 +68,11 @@ pub enum Event {
         /// Its name.
         job: String,
     },
+    /// Something for a person to know.
+    Note {
+        /// The sentence.
+        text: String,
+    },
     /// Something to tell a person.
     Warning {
         /// The sentence.

@@ -64,11 +64,14 @@ pub fn add_model(
     seed: u64,
 ) -> Result<ModelJobs> {
     let ModelSource { images, positions, pairs: chosen } = source;
-    let params = match kind {
-        ModelKind::Scene => config.features.clone(),
-        ModelKind::Local => config.photo_features(),
+    let features = match kind {
+        ModelKind::Scene => {
+            let (first, second) = (config.features.clone(), config.second_features());
+            let params = |image: &SourceImage| if image.second_look { &second } else { &first };
+            images.iter().map(|image| add_features(graph, image, params(image))).collect()
+        }
+        ModelKind::Local => add_features_of(graph, images, &config.photo_features()),
     };
-    let features = add_features_of(graph, images, &params);
     let mut pairs = Vec::new();
     for &(a, b) in chosen {
         pairs.push((a, b, add_pair(graph, images, &features, (a, b), config, seed)));

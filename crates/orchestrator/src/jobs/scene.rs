@@ -16,7 +16,7 @@ use super::model::{
     ModelJobs, ModelKind, ModelSource, add_model, features_role, image_of_place_holder, with_names,
 };
 use super::positions::{self, Fix};
-use crate::artifacts::SceneIndices;
+use crate::artifacts::{LeftApart, SceneIndices};
 use crate::codec::Artifact;
 use crate::config::Config;
 use crate::dataset::SourceImage;
@@ -32,8 +32,23 @@ pub struct SceneJobs {
     pub features: Vec<JobId>,
     /// The job whose result the model is.
     pub model: JobId,
+    /// Which images the model leaves out of its largest component.
+    pub left_apart: JobId,
     /// The scene file.
     pub scene: JobId,
+    /// The model's images, in its order, as places in the list of the images given.
+    order: Vec<usize>,
+}
+
+impl SceneJobs {
+    /// The images given, those to be looked at once more that the model leaves apart.
+    pub fn looked_at_again(&self, images: &[SourceImage], left: &LeftApart) -> Vec<SourceImage> {
+        let mut images = images.to_vec();
+        for at in left.images.iter().filter_map(|&at| self.order.get(at as usize)) {
+            images[*at].second_look = true;
+        }
+        images
+    }
 }
 
 /// The jobs of a scene's model alone.
@@ -104,6 +119,39 @@ pub fn add_first_model(
     Ok(SceneModelJobs { model: jobs.model, order })
 }
 
+/// Adds the job that says which images a model leaves apart.
+fn add_left_apart(graph: &mut JobGraph<'_>, model: JobId, num_images: usize) -> JobId {
+    let work = move |inputs: &Inputs<'_, '_>| {
+        let model = inputs.get::<MapperOutput>("model")?;
+        Product::new(left_apart(&model, num_images))
+    };
+    let left_apart = graph.add(Job {
+        kind: "left_apart",
+        version: stages::LEFT_APART_VERSION,
+        name: "scene".to_owned(),
+        params: json!({ "images": num_images }),
+        external: BTreeMap::new(),
+        memory: 1 << 20,
+        work: Box::new(work),
+    });
+    graph.require(left_apart, "model", model);
+    left_apart
+}
+
+/// What a model of so many images leaves apart; of a model without components that is everything.
+fn left_apart(model: &MapperOutput, num_images: usize) -> LeftApart {
+    let pairs_of = |images: usize| (images * images.saturating_sub(1) / 2) as u64;
+    let known_pairs = model.components.iter().map(|component| pairs_of(component.registered().count())).sum();
+    let pairs = pairs_of(num_images);
+    let Some(largest) = model.components.first() else {
+        return LeftApart { images: (0..num_images as u32).collect(), known_pairs, pairs };
+    };
+    // All components list the same images, those that have features.
+    let apart = largest.images.iter().filter(|image| image.world_from_camera.is_none());
+    let place = |image: &ReconstructionImage| Some(image_of_place_holder(&image.name)? as u32);
+    LeftApart { images: apart.filter_map(place).collect(), known_pairs, pairs }
+}
+
 /// Adds all jobs from image files to a scene file; `alike` are pairs of images that look alike.
 ///
 /// # Errors
@@ -117,6 +165,7 @@ pub fn add_scene(
 ) -> Result<SceneJobs> {
     let OrderedModel { jobs, images, order, positions, origin } =
         add_ordered_model(graph, images, alike, config, seed)?;
+    let left_apart = add_left_apart(graph, jobs.model, images.len());
     let index_params = config.index.clone();
     let index_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
@@ -248,7 +297,7 @@ pub fn add_scene(
     for (&at, &job) in order.iter().zip(&jobs.features) {
         features[at] = job;
     }
-    Ok(SceneJobs { features, model: jobs.model, scene })
+    Ok(SceneJobs { features, model: jobs.model, left_apart, scene, order })
 }
 
 /// Which component a note is of, unless it is the largest.
@@ -452,6 +501,7 @@ mod tests {
             camera_origin: CameraOrigin::Listed,
             position: Some(GeoPosition { lat_deg, lon_deg, alt_m }),
             mask: None,
+            second_look: false,
         };
         let places = [
             (-17.0, 179.999, Some(12.0)),

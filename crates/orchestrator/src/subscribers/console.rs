@@ -108,6 +108,7 @@ impl Observer for Console {
                 self.tell(&format!("warning: {kind} {job}: {reason}"));
                 self.step(kind, false);
             }
+            Event::Note { text } => self.tell(&format!("note: {text}")),
             Event::Warning { text } => self.tell(&format!("warning: {text}")),
             Event::Started { .. } => {}
             Event::Ended => {
