@@ -1,52 +1,48 @@
 //! One component of a set: rigid pose, joint refinement with guided matching, verdicts.
 
+mod answers;
 mod distrust;
 mod hung;
+mod observations;
 mod walls;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
-use nalgebra::{Matrix3, Matrix6, Vector3};
+use nalgebra::{Matrix6, Vector3};
 use rayon::prelude::*;
-use setloc_features::{Calibration, Camera, Keypoint};
-use setloc_sfm::{ImageId, Place, PointId, Reconstruction, Rigid, Similarity, WallSight};
+use setloc_features::{Calibration, Camera};
+use setloc_sfm::{Reconstruction, Rigid, Similarity, WallSight};
 
 use self::distrust::is_distrusted;
+use self::observations::free_views;
 use self::walls::agreeing_walls;
 use super::called;
 use super::correspondences::{SetCorrespondence, correspondences, set_rays};
 use super::rigid::{RigidPose, SetPhotos, rigid_pose};
 use super::sights::{SetView, Sights};
 use crate::evidence::{
-    PhotoRays, chance_of_inlier, log10_chance_of_more, log10_false_alarms, median, occupied_cells, same_pose,
+    PhotoRays, chance_of_inlier, log10_chance_of_more, log10_false_alarms, median, occupied_cells,
 };
 use crate::guided::guided_matches;
 use crate::refine::{
-    JointCamera, JointModel, JointObservations, JointPhoto, KnownOfCamera, SceneView, Sighting, TiedPoint,
+    JointCamera, JointModel, JointObservations, JointPhoto, KnownOfCamera, SceneView, Sighting,
     refine_jointly,
 };
-use crate::single::{inliers, union};
 use crate::stretch::PhotoStretch;
 use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
-use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_precision, judge_support, weaker};
+use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_support, weaker};
 use crate::{
-    CamsetParams, GuidedParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization,
-    Verdict, Views,
+    CamsetParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, Verdict, Views,
 };
 
 /// Correspondences in a minimal sample of the generalized pose with scale.
 const SAMPLE: usize = 4;
 /// Factors on inlier bound and search radius in the last rounds; before, drift may still be larger.
 const WIDENING: [f64; 3] = [2.5, 1.5, 1.0];
-/// Share of the rigid pose's correspondences that the joint refinement has to bring within the inlier bound.
-const MIN_KEPT: f64 = 0.5;
 
 /// Fewest matches seen from elsewhere than the rest that give a set its scale at all.
 const MIN_FOR_SCALE: usize = 3;
-
-/// Scene points that tell the focal length of a photo whose local model does not.
-const MIN_TELLING: usize = 30;
 
 /// Scales at which a set is tried to see what it shows by chance; nearer ones show some of what the right one does.
 const OTHER_SCALES: [f64; 10] = [0.15, 0.25, 0.35, 0.5, 0.6, 1.6, 2.0, 2.8, 4.0, 6.0];
@@ -721,397 +717,12 @@ impl Component<'_> {
         };
         self.joint_cameras().into_iter().enumerate().filter_map(contradicted).collect()
     }
-
-    /// Correspondences that agree with the rigid pose, as they are.
-    fn rigid_observations(&self, candidates: &[SetCorrespondence], rigid: &RigidPose) -> JointObservations {
-        let mut direct = vec![Vec::new(); self.members.len()];
-        let (mut locals, mut tied) = (BTreeSet::new(), Vec::new());
-        for &number in &rigid.agreeing {
-            let candidate = &candidates[number];
-            for &(slot, feature) in &candidate.seen_by {
-                direct[slot].push(SceneMatch { feature, point: candidate.scene });
-            }
-            if let Some(local) = candidate.local.filter(|local| locals.insert(*local)) {
-                tied.extend(self.tied(local, candidate.scene, &rigid.world_from_set));
-            }
-        }
-        let direct = direct.into_iter().map(unique).collect();
-        JointObservations { direct, tied, tracks: self.free_tracks(&locals), ..JointObservations::default() }
-    }
-
-    /// A local point as a scene point with all its sightings, where it is aligned.
-    fn tied(&self, local: usize, scene: PointId, world_from_set: &Similarity) -> Option<TiedPoint> {
-        let aligned = self.model.points[local].aligned.as_ref()?;
-        let spot = world_from_set.transform_covariance(&aligned.spot.cast());
-        Some(TiedPoint { scene, seen: self.sightings(local), spot })
-    }
-
-    /// Correspondences and guided matches that agree with the present poses.
-    ///
-    /// A local point that is a scene point is replaced by it, in all photos that see it.
-    fn observations(
-        &self,
-        model: &JointModel,
-        rays: &[PhotoRays<'_>],
-        candidates: &[SetCorrespondence],
-        world_from_set: &Similarity,
-        widening: f64,
-    ) -> JointObservations {
-        let index = self.scene.index;
-        let bound = self.params.max_error_sigmas * widening;
-        let guided_params =
-            GuidedParams { radius_px: self.params.guided.radius_px * widening, ..self.params.guided.clone() };
-        let guided: Vec<Vec<SceneMatch>> = (0..self.members.len())
-            .into_par_iter()
-            .with_max_len(1)
-            .map(|slot| {
-                let pose = &model.photos[slot].world_from_camera;
-                let nearest = &self.evidence[self.members[slot]].nearest;
-                guided_matches(&guided_params, index, &rays[slot], nearest, pose)
-            })
-            .collect();
-        let agrees = |slot: usize, feature: u32, point: PointId| {
-            let found = SceneMatch { feature, point };
-            rays[slot].error_sigmas(index, &model.photos[slot].world_from_camera, found) < bound
-        };
-        let local_of = self.local_points_of_features();
-        let mut votes: BTreeMap<usize, BTreeMap<PointId, usize>> = BTreeMap::new();
-        let mut lone: Vec<Vec<SceneMatch>> = vec![Vec::new(); self.members.len()];
-        for candidate in candidates {
-            match candidate.local {
-                Some(local) => *votes.entry(local).or_default().entry(candidate.scene).or_default() += 1,
-                None => lone[candidate.seen_by[0].0]
-                    .push(SceneMatch { feature: candidate.seen_by[0].1, point: candidate.scene }),
-            }
-        }
-        for (slot, found) in guided.iter().enumerate() {
-            let mut own = Vec::new();
-            for &found in found {
-                match local_of[slot].get(&found.feature) {
-                    Some(&local) => *votes.entry(local).or_default().entry(found.point).or_default() += 1,
-                    None => own.push(found),
-                }
-            }
-            lone[slot] = union(
-                &inliers(&rays[slot], index, &model.photos[slot].world_from_camera, &lone[slot], bound),
-                &own,
-            );
-        }
-        let mut direct: Vec<Vec<SceneMatch>> = vec![Vec::new(); self.members.len()];
-        let (mut locals, mut tied) = (BTreeSet::new(), Vec::new());
-        for (local, votes) in votes {
-            let track = self.track(local);
-            let best = votes
-                .into_iter()
-                .map(|(point, votes)| {
-                    let agreeing =
-                        track.iter().filter(|&&(slot, feature)| agrees(slot, feature, point)).count();
-                    (agreeing, votes, std::cmp::Reverse(point))
-                })
-                .max();
-            let Some((agreeing, _, std::cmp::Reverse(point))) = best else { continue };
-            if agreeing == 0 || 2 * agreeing < track.len() {
-                continue;
-            }
-            locals.insert(local);
-            for (slot, feature) in track {
-                if agrees(slot, feature, point) {
-                    direct[slot].push(SceneMatch { feature, point });
-                }
-            }
-            if let Some(mut point_seen) = self.tied(local, point, world_from_set) {
-                let position = index.position(point);
-                let noise = index.position_covariance(point);
-                point_seen.seen.retain(|seen| {
-                    let pose = &model.photos[seen.photo].world_from_camera;
-                    rays[seen.photo].sighting_error_sigmas(pose, seen, &position, &noise) < bound
-                });
-                tied.push(point_seen);
-            }
-        }
-        for (slot, lone) in lone.iter().enumerate() {
-            let agreeing = inliers(&rays[slot], index, &model.photos[slot].world_from_camera, lone, bound);
-            direct[slot] = unique(union(&direct[slot], &agreeing));
-        }
-        let tracks = agreeing_tracks(model, rays, self.free_tracks(&locals), bound);
-        JointObservations { direct, tied, tracks, ..JointObservations::default() }
-    }
-
-    /// Slots and features that see a local point.
-    fn track(&self, local: usize) -> Vec<(usize, u32)> {
-        self.seen_by_keypoints(local).map(|(_, slot, feature, _)| (slot, feature)).collect()
-    }
-
-    /// The keypoints of a local point: place in its track, slot, feature and the keypoint.
-    fn seen_by_keypoints(&self, local: usize) -> impl Iterator<Item = (usize, usize, u32, &Keypoint)> {
-        self.model.points[local].track.iter().enumerate().filter_map(|(at, seen)| {
-            let slot = self.members.binary_search(&seen.image.index()).ok()?;
-            let keypoints = &self.photos[self.members[slot]].features.keypoints;
-            Some((at, slot, seen.feature, keypoints.get(seen.feature as usize)?))
-        })
-    }
-
-    /// Where the photos show a local point: by their pixels where it is aligned, else by their keypoints.
-    fn sightings(&self, local: usize) -> Vec<Sighting> {
-        let point = &self.model.points[local];
-        let slot_of = |image: ImageId| self.members.binary_search(&image.index()).ok();
-        let by_keypoint = self.seen_by_keypoints(local).filter_map(|(at, photo, feature, keypoint)| {
-            let own = Place::from(keypoint);
-            let place = match &point.aligned {
-                Some(aligned) => *aligned.places.get(at)?,
-                None => own,
-            };
-            Some(Sighting { photo, feature: Some(feature), place, keypoint_noise_px: own.noise_px })
-        });
-        let mut sightings: Vec<Sighting> = by_keypoint.collect();
-        if let Some(aligned) = &point.aligned {
-            let noise = sightings.iter().map(|seen| seen.keypoint_noise_px).collect();
-            let keypoint_noise_px = median(noise).unwrap_or(0.0);
-            let further = aligned.further.iter().filter_map(|&(image, place)| {
-                Some(Sighting { photo: slot_of(image)?, feature: None, place, keypoint_noise_px })
-            });
-            sightings.extend(further);
-        }
-        sightings
-    }
-
-    fn local_points_of_features(&self) -> Vec<BTreeMap<u32, usize>> {
-        let mut local_of = vec![BTreeMap::new(); self.members.len()];
-        for local in 0..self.model.points.len() {
-            for (slot, feature) in self.track(local) {
-                local_of[slot].insert(feature, local);
-            }
-        }
-        local_of
-    }
-
-    /// Sightings of all local points that are not scene points.
-    fn free_tracks(&self, tied: &BTreeSet<usize>) -> Vec<(usize, Sighting)> {
-        (0..self.model.points.len())
-            .filter(|local| !tied.contains(local))
-            .flat_map(|local| {
-                let seen = self.sightings(local);
-                let seen_twice = seen.len() >= 2;
-                seen.into_iter().filter(move |_| seen_twice).map(move |seen| (local, seen))
-            })
-            .collect()
-    }
-
-    fn rigid_answers(
-        &self,
-        set_from_camera: &[Rigid],
-        candidates: &[SetCorrespondence],
-        rigid: &RigidPose,
-        verdict: Verdict,
-        reasons: &[String],
-    ) -> Vec<PhotoLocalization> {
-        let mut seen = vec![0; self.members.len()];
-        for &(slot, _) in rigid.agreeing.iter().flat_map(|&number| &candidates[number].seen_by) {
-            seen[slot] += 1;
-        }
-        let spread = &rigid.observability;
-        // One photo has no scale, nor has a set of which the rays tell none.
-        let scale =
-            spread.log_scale.is_finite().then(|| format!(", scale ± {:.1} %", 100.0 * spread.log_scale));
-        let precision = format!(
-            "as a rigid set: rotation ± {:.2}°, position ± {:.1} % of the viewing distance{}",
-            spread.rotation_rad.to_degrees(),
-            100.0 * spread.position,
-            scale.unwrap_or_default()
-        );
-        (0..self.members.len())
-            .map(|slot| PhotoLocalization {
-                name: self.photos[self.members[slot]].name.to_owned(),
-                camera: self.model.cameras[self.camera_of(slot)].clone(),
-                component: self.scene.component,
-                world_from_camera: Some(rigid.world_from_set.transform_pose(&set_from_camera[slot])),
-                covariance: None,
-                inliers: seen[slot],
-                verdict,
-                reasons: reasons.iter().cloned().chain([precision.clone()]).collect(),
-            })
-            .collect()
-    }
-
-    /// The answers, and whether each photo stands elsewhere when localized alone.
-    fn refined_answers(
-        &self,
-        candidates: &[SetCorrespondence],
-        rigid: &RigidPose,
-        joint: &Joint,
-        support: Verdict,
-        reasons: &[String],
-    ) -> (Vec<PhotoLocalization>, Vec<bool>) {
-        let kept = rigid.agreeing.iter().filter(|&&number| {
-            let candidate = &candidates[number];
-            let seen = |&(slot, feature): &(usize, u32)| {
-                joint.direct[slot].binary_search(&SceneMatch { feature, point: candidate.scene }).is_ok()
-            };
-            candidate.seen_by.iter().any(seen)
-        });
-        let supporting = rigid.agreeing.len() + rigid.sights.len() + rigid.lone.len();
-        let kept = (kept.count() + joint.kept_sights) as f64 / supporting.max(1) as f64;
-        (0..self.members.len())
-            .map(|slot| {
-                let photo = self.members[slot];
-                let pose = joint.model.photos[slot].world_from_camera;
-                let mut reasons = reasons.to_vec();
-                let depth = self.depth(joint, slot);
-                let covariance = joint.covariances.get(slot).copied().flatten();
-                let precision =
-                    judge_precision(&self.params.verdict, covariance.as_ref(), depth, &mut reasons);
-                let mut verdict = support;
-                if kept < MIN_KEPT {
-                    reasons.push(format!(
-                        "{:.0} % of these matches fit after the joint refinement only",
-                        100.0 * kept
-                    ));
-                    verdict = weaker(verdict, Verdict::Uncertain);
-                }
-                let is_elsewhere = self.agrees_alone(&joint.model.photos, slot, depth) == Some(false);
-                match self.standpoint_agrees_alone(&joint.model.photos, slot, depth) {
-                    // The photos' own matches are evidence that the set's pose did not create.
-                    Some(true) => {
-                        reasons.push("localized alone, it stands at the same place".to_owned());
-                        verdict = Verdict::Localized;
-                    }
-                    Some(false) => {
-                        let which = if is_elsewhere { "it" } else { "another photo of its standpoint" };
-                        reasons.push(format!("localized alone, {which} stands elsewhere"));
-                        verdict = Verdict::Uncertain;
-                    }
-                    None => {
-                        let seen = joint.direct[slot].len() + joint.viewed[slot];
-                        if seen < MIN_TELLING && !self.is_camera_told(slot) {
-                            reasons.push(format!("nothing but {seen} scene points tells its focal length"));
-                            verdict = weaker(verdict, Verdict::Uncertain);
-                        }
-                    }
-                }
-                let of_standpoint =
-                    |to: usize| joint.model.photos[to].standpoint == joint.model.photos[slot].standpoint;
-                let lengths = self.lengths().filter(|&([.., to], _)| of_standpoint(to));
-                reasons.extend(lengths.map(|(slots, length)| self.basis(slots, &length)));
-                let verdict = weaker(verdict, precision);
-                let answer = PhotoLocalization {
-                    name: self.photos[photo].name.to_owned(),
-                    camera: joint.model.camera_of(slot).clone(),
-                    component: self.scene.component,
-                    world_from_camera: Some(pose),
-                    covariance,
-                    inliers: joint.direct[slot].len() + joint.viewed[slot] + joint.walls[slot],
-                    verdict,
-                    reasons,
-                };
-                (answer, is_elsewhere)
-            })
-            .unzip()
-    }
-
-    /// Whether intrinsics are known, shared with another photo of the model or told by its points.
-    ///
-    /// With one other photo an unknown focal length fits as well as a step ahead does, and a few scene points fit both.
-    fn is_camera_told(&self, slot: usize) -> bool {
-        let photo = self.members[slot];
-        let shares_it = |other: usize| other != slot && self.camera_of(other) == self.camera_of(slot);
-        self.photos[photo].calibration != Calibration::Guessed
-            || (0..self.members.len()).any(shares_it)
-            || self.model.tells_camera_of(&[ImageId(photo as u32)])
-    }
-
-    /// Whether the photo stands at the same place when localized alone; `None` when it is not.
-    fn agrees_alone(&self, joint: &[JointPhoto], slot: usize, depth: f64) -> Option<bool> {
-        let alone = &self.evidence[self.members[slot]].photo;
-        let own = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized)?;
-        Some(same_pose(&joint[slot].world_from_camera, &own, depth))
-    }
-
-    /// The same of all photos of its standpoint.
-    fn standpoint_agrees_alone(&self, joint: &[JointPhoto], slot: usize, depth: f64) -> Option<bool> {
-        let mates = (0..joint.len()).filter(|&mate| joint[mate].standpoint == joint[slot].standpoint);
-        mates.filter_map(|mate| self.agrees_alone(joint, mate, depth)).reduce(|a, b| a && b)
-    }
-
-    /// Median distance of what a photo sees: the scene points that it or its standpoint sees, else these and the local points that
-    /// another standpoint sees, too; zero where they are fewer than half of what a verdict asks for.
-    ///
-    /// A few of the scene may be chance, at any distance, and what one standpoint sees alone has none. Where nothing but one
-    /// standpoint is placed, local points have no scale: so the scene's come first.
-    fn depth(&self, joint: &Joint, slot: usize) -> f64 {
-        let photos = &joint.model.photos;
-        let standpoint = |slot: usize| photos[slot].standpoint;
-        let center = photos[slot].world_from_camera.translation;
-        let beside: Vec<usize> =
-            (0..photos.len()).filter(|&other| standpoint(other) == standpoint(slot)).collect();
-        let of_scene = |slot: usize| {
-            let direct = joint.direct[slot].iter().map(|seen| self.scene.index.position(seen.point));
-            direct.chain(joint.met[slot].iter().copied())
-        };
-        let local = |slot: usize| {
-            let is_seen = move |local: &usize| {
-                let track = self.track(*local);
-                track.iter().any(|&(seer, _)| seer == slot)
-                    && track.iter().any(|&(seer, _)| standpoint(seer) != standpoint(slot))
-            };
-            (0..self.model.points.len()).filter(is_seen).map(|local| joint.model.points[local])
-        };
-        let median_of = |least: usize, points: &mut dyn Iterator<Item = Vector3<f64>>| {
-            let distances: Vec<f64> = points.map(|point| (point - center).norm()).collect();
-            (distances.len() >= least).then(|| median(distances)).flatten()
-        };
-        let (many, some) = (self.params.verdict.min_inliers, self.params.verdict.min_inliers / 2);
-        median_of(many, &mut of_scene(slot))
-            .or_else(|| median_of(many, &mut beside.iter().copied().flat_map(of_scene)))
-            .or_else(|| median_of(some, &mut of_scene(slot).chain(local(slot))))
-            .or_else(|| {
-                median_of(some, &mut beside.iter().flat_map(|&slot| of_scene(slot).chain(local(slot))))
-            })
-            .unwrap_or(0.0)
-    }
-}
-
-/// Those of some sights whose local points are free.
-fn free_views(sights: &Sights, agreeing: &[usize], tracks: &[(usize, Sighting)]) -> Vec<(usize, SceneView)> {
-    let free: BTreeSet<usize> = tracks.iter().map(|(local, _)| *local).collect();
-    let view = |&at: &usize| {
-        let sight = &sights.all[at];
-        let view = SceneView { image: sight.seen.image, place: sight.place };
-        free.contains(&sight.local).then_some((sight.local, view))
-    };
-    agreeing.iter().filter_map(view).collect()
-}
-
-/// The observations that agree with the present poses and local points; points seen once only are left out.
-fn agreeing_tracks(
-    model: &JointModel,
-    rays: &[PhotoRays<'_>],
-    tracks: Vec<(usize, Sighting)>,
-    bound: f64,
-) -> Vec<(usize, Sighting)> {
-    let mut views = vec![0_usize; model.points.len()];
-    let mut agreeing = tracks;
-    agreeing.retain(|(point, seen)| {
-        let pose = &model.photos[seen.photo].world_from_camera;
-        let error =
-            rays[seen.photo].sighting_error_sigmas(pose, seen, &model.points[*point], &Matrix3::zeros());
-        views[*point] += usize::from(error < bound);
-        error < bound
-    });
-    agreeing.retain(|(point, _)| views[*point] >= 2);
-    agreeing
 }
 
 /// First photo with the same centre; the mapper gives photos of one standpoint exactly one.
 fn standpoint(set_from_camera: &[Rigid], slot: usize) -> usize {
     let center = set_from_camera[slot].translation;
     (0..slot).find(|&other| set_from_camera[other].translation == center).unwrap_or(slot)
-}
-
-/// Each feature once, by its first match; sorted.
-fn unique(mut matches: Vec<SceneMatch>) -> Vec<SceneMatch> {
-    matches.sort_unstable();
-    matches.dedup_by_key(|m| m.feature);
-    matches
 }
 
 /// Number of agreeing correspondences with a ray from another place than the photo that has most of them.

@@ -1,0 +1,192 @@
+//! What a component's poses come to: an answer for each photo.
+
+use nalgebra::Vector3;
+use setloc_features::Calibration;
+use setloc_sfm::{ImageId, Rigid};
+
+use super::{Component, Joint};
+use crate::evidence::{median, same_pose};
+use crate::refine::JointPhoto;
+use crate::set::correspondences::SetCorrespondence;
+use crate::set::rigid::RigidPose;
+use crate::verdict::{judge_precision, weaker};
+use crate::{PhotoLocalization, SceneMatch, Verdict};
+
+/// Share of the rigid pose's correspondences that the joint refinement has to bring within the inlier bound.
+const MIN_KEPT: f64 = 0.5;
+/// Scene points that tell the focal length of a photo whose local model does not.
+const MIN_TELLING: usize = 30;
+
+impl Component<'_> {
+    pub(super) fn rigid_answers(
+        &self,
+        set_from_camera: &[Rigid],
+        candidates: &[SetCorrespondence],
+        rigid: &RigidPose,
+        verdict: Verdict,
+        reasons: &[String],
+    ) -> Vec<PhotoLocalization> {
+        let mut seen = vec![0; self.members.len()];
+        for &(slot, _) in rigid.agreeing.iter().flat_map(|&number| &candidates[number].seen_by) {
+            seen[slot] += 1;
+        }
+        let spread = &rigid.observability;
+        // One photo has no scale, nor has a set of which the rays tell none.
+        let scale =
+            spread.log_scale.is_finite().then(|| format!(", scale ± {:.1} %", 100.0 * spread.log_scale));
+        let precision = format!(
+            "as a rigid set: rotation ± {:.2}°, position ± {:.1} % of the viewing distance{}",
+            spread.rotation_rad.to_degrees(),
+            100.0 * spread.position,
+            scale.unwrap_or_default()
+        );
+        (0..self.members.len())
+            .map(|slot| PhotoLocalization {
+                name: self.photos[self.members[slot]].name.to_owned(),
+                camera: self.model.cameras[self.camera_of(slot)].clone(),
+                component: self.scene.component,
+                world_from_camera: Some(rigid.world_from_set.transform_pose(&set_from_camera[slot])),
+                covariance: None,
+                inliers: seen[slot],
+                verdict,
+                reasons: reasons.iter().cloned().chain([precision.clone()]).collect(),
+            })
+            .collect()
+    }
+
+    /// The answers, and whether each photo stands elsewhere when localized alone.
+    pub(super) fn refined_answers(
+        &self,
+        candidates: &[SetCorrespondence],
+        rigid: &RigidPose,
+        joint: &Joint,
+        support: Verdict,
+        reasons: &[String],
+    ) -> (Vec<PhotoLocalization>, Vec<bool>) {
+        let kept = rigid.agreeing.iter().filter(|&&number| {
+            let candidate = &candidates[number];
+            let seen = |&(slot, feature): &(usize, u32)| {
+                joint.direct[slot].binary_search(&SceneMatch { feature, point: candidate.scene }).is_ok()
+            };
+            candidate.seen_by.iter().any(seen)
+        });
+        let supporting = rigid.agreeing.len() + rigid.sights.len() + rigid.lone.len();
+        let kept = (kept.count() + joint.kept_sights) as f64 / supporting.max(1) as f64;
+        (0..self.members.len())
+            .map(|slot| {
+                let photo = self.members[slot];
+                let pose = joint.model.photos[slot].world_from_camera;
+                let mut reasons = reasons.to_vec();
+                let depth = self.depth(joint, slot);
+                let covariance = joint.covariances.get(slot).copied().flatten();
+                let precision =
+                    judge_precision(&self.params.verdict, covariance.as_ref(), depth, &mut reasons);
+                let mut verdict = support;
+                if kept < MIN_KEPT {
+                    reasons.push(format!(
+                        "{:.0} % of these matches fit after the joint refinement only",
+                        100.0 * kept
+                    ));
+                    verdict = weaker(verdict, Verdict::Uncertain);
+                }
+                let is_elsewhere = self.agrees_alone(&joint.model.photos, slot, depth) == Some(false);
+                match self.standpoint_agrees_alone(&joint.model.photos, slot, depth) {
+                    // The photos' own matches are evidence that the set's pose did not create.
+                    Some(true) => {
+                        reasons.push("localized alone, it stands at the same place".to_owned());
+                        verdict = Verdict::Localized;
+                    }
+                    Some(false) => {
+                        let which = if is_elsewhere { "it" } else { "another photo of its standpoint" };
+                        reasons.push(format!("localized alone, {which} stands elsewhere"));
+                        verdict = Verdict::Uncertain;
+                    }
+                    None => {
+                        let seen = joint.direct[slot].len() + joint.viewed[slot];
+                        if seen < MIN_TELLING && !self.is_camera_told(slot) {
+                            reasons.push(format!("nothing but {seen} scene points tells its focal length"));
+                            verdict = weaker(verdict, Verdict::Uncertain);
+                        }
+                    }
+                }
+                let of_standpoint =
+                    |to: usize| joint.model.photos[to].standpoint == joint.model.photos[slot].standpoint;
+                let lengths = self.lengths().filter(|&([.., to], _)| of_standpoint(to));
+                reasons.extend(lengths.map(|(slots, length)| self.basis(slots, &length)));
+                let verdict = weaker(verdict, precision);
+                let answer = PhotoLocalization {
+                    name: self.photos[photo].name.to_owned(),
+                    camera: joint.model.camera_of(slot).clone(),
+                    component: self.scene.component,
+                    world_from_camera: Some(pose),
+                    covariance,
+                    inliers: joint.direct[slot].len() + joint.viewed[slot] + joint.walls[slot],
+                    verdict,
+                    reasons,
+                };
+                (answer, is_elsewhere)
+            })
+            .unzip()
+    }
+
+    /// Whether intrinsics are known, shared with another photo of the model or told by its points.
+    ///
+    /// With one other photo an unknown focal length fits as well as a step ahead does, and a few scene points fit both.
+    fn is_camera_told(&self, slot: usize) -> bool {
+        let photo = self.members[slot];
+        let shares_it = |other: usize| other != slot && self.camera_of(other) == self.camera_of(slot);
+        self.photos[photo].calibration != Calibration::Guessed
+            || (0..self.members.len()).any(shares_it)
+            || self.model.tells_camera_of(&[ImageId(photo as u32)])
+    }
+
+    /// Whether the photo stands at the same place when localized alone; `None` when it is not.
+    fn agrees_alone(&self, joint: &[JointPhoto], slot: usize, depth: f64) -> Option<bool> {
+        let alone = &self.evidence[self.members[slot]].photo;
+        let own = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized)?;
+        Some(same_pose(&joint[slot].world_from_camera, &own, depth))
+    }
+
+    /// The same of all photos of its standpoint.
+    fn standpoint_agrees_alone(&self, joint: &[JointPhoto], slot: usize, depth: f64) -> Option<bool> {
+        let mates = (0..joint.len()).filter(|&mate| joint[mate].standpoint == joint[slot].standpoint);
+        mates.filter_map(|mate| self.agrees_alone(joint, mate, depth)).reduce(|a, b| a && b)
+    }
+
+    /// Median distance of what a photo sees: the scene points that it or its standpoint sees, else these and the local points that
+    /// another standpoint sees, too; zero where they are fewer than half of what a verdict asks for.
+    ///
+    /// A few of the scene may be chance, at any distance, and what one standpoint sees alone has none. Where nothing but one
+    /// standpoint is placed, local points have no scale: so the scene's come first.
+    pub(super) fn depth(&self, joint: &Joint, slot: usize) -> f64 {
+        let photos = &joint.model.photos;
+        let standpoint = |slot: usize| photos[slot].standpoint;
+        let center = photos[slot].world_from_camera.translation;
+        let beside: Vec<usize> =
+            (0..photos.len()).filter(|&other| standpoint(other) == standpoint(slot)).collect();
+        let of_scene = |slot: usize| {
+            let direct = joint.direct[slot].iter().map(|seen| self.scene.index.position(seen.point));
+            direct.chain(joint.met[slot].iter().copied())
+        };
+        let local = |slot: usize| {
+            let is_seen = move |local: &usize| {
+                let track = self.track(*local);
+                track.iter().any(|&(seer, _)| seer == slot)
+                    && track.iter().any(|&(seer, _)| standpoint(seer) != standpoint(slot))
+            };
+            (0..self.model.points.len()).filter(is_seen).map(|local| joint.model.points[local])
+        };
+        let median_of = |least: usize, points: &mut dyn Iterator<Item = Vector3<f64>>| {
+            let distances: Vec<f64> = points.map(|point| (point - center).norm()).collect();
+            (distances.len() >= least).then(|| median(distances)).flatten()
+        };
+        let (many, some) = (self.params.verdict.min_inliers, self.params.verdict.min_inliers / 2);
+        median_of(many, &mut of_scene(slot))
+            .or_else(|| median_of(many, &mut beside.iter().copied().flat_map(of_scene)))
+            .or_else(|| median_of(some, &mut of_scene(slot).chain(local(slot))))
+            .or_else(|| {
+                median_of(some, &mut beside.iter().flat_map(|&slot| of_scene(slot).chain(local(slot))))
+            })
+            .unwrap_or(0.0)
+    }
+}
