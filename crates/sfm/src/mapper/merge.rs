@@ -106,7 +106,7 @@ impl MergeRecord {
         }
         (self.verdict == MergeVerdict::Joined).then(|| {
             let (found, expected) = (self.found_matches, self.expected_matches);
-            let shared = if is_like(found, expected) == Some(false) {
+            let shared = if expected >= MIN_EXPECTED_MATCHES && found < MIN_LIKENESS_OF_PAIRS * expected {
                 format!(
                     "panoramas that stand next to each other share what neighbours do (of the {expected:.0} views of \
                      points that there would be with nothing between, {found:.0})"
@@ -139,6 +139,10 @@ const MAX_LOG_SCALE_SIGMA: f64 = 0.05;
 const MIN_EXPECTED_MATCHES: f64 = 10.0;
 /// Smallest share of the matches expected by likeness.
 const MIN_LIKENESS: f64 = 0.3;
+/// The same where most pairs across have the rotation that the similarity gives them.
+const MIN_LIKENESS_OF_PAIRS: f64 = 0.2;
+/// Share of the verified matches across that are of such pairs where these are most.
+const CLEAR_AGREEMENT: f64 = 0.6;
 /// How many times more matches must agree when too little is in plain view to be judged by.
 const UNJUDGED_SUPPORT: usize = 2;
 /// Two similarities that differ by less than this share of the distance to what is seen are one.
@@ -499,8 +503,10 @@ impl<'a> Attempt<'_, '_, 'a> {
             return MergeVerdict::ScaleOpen;
         }
         let is_judged = |seen: &Visibility| seen.expected >= params.min_visible_points;
-        let is_recognized = if let Some(is_like) = is_like(likeness.matched, likeness.expected) {
-            is_like
+        let pair_agreement = self.pair_agreement(kept_from_moved);
+        let is_recognized = if likeness.expected >= MIN_EXPECTED_MATCHES {
+            let least = if pair_agreement >= CLEAR_AGREEMENT { MIN_LIKENESS_OF_PAIRS } else { MIN_LIKENESS };
+            likeness.matched >= least * likeness.expected
         } else if seen.iter().any(is_judged) {
             seen.iter().all(|seen| !is_judged(seen) || params.is_recognized(seen))
         } else {
@@ -511,7 +517,7 @@ impl<'a> Attempt<'_, '_, 'a> {
         if !is_recognized && !self.share_as_neighbours(|image| self.pose_in_kept(image, kept_from_moved)) {
             return MergeVerdict::NotRecognized;
         }
-        if self.pair_agreement(kept_from_moved) < params.min_pair_agreement {
+        if pair_agreement < params.min_pair_agreement {
             return MergeVerdict::PairsDisagree;
         }
         if self.positions_disagree(kept_from_moved) {
@@ -743,11 +749,6 @@ impl<'a> Attempt<'_, '_, 'a> {
         model.registered().all(|image| model.input.is_panoramic(image))
             && Support::across(model, is_moved, self.params.max_error_sigma).is_untenable()
     }
-}
-
-/// Whether so many matches of those that likeness expects are enough; `None` where it expects too few to judge by.
-fn is_like(matched: f64, expected: f64) -> Option<bool> {
-    (expected >= MIN_EXPECTED_MATCHES).then_some(matched >= MIN_LIKENESS * expected)
 }
 
 /// The upper middle of the finite values.
