@@ -245,8 +245,9 @@ fn photos_between_panoramas_that_share_little_are_placed_by_what_each_shows() {
     let refined = |max_images: usize| {
         let mut config = Config::default();
         config.camset.views.max_images = max_images;
-        // With one the panoramas share enough.
+        // With these points are enough.
         config.second_look.enabled = false;
+        config.camset.scale_by_walls = false;
         let mut figures = bench_with(folder.path(), config);
         figures.sets[0].methods.remove("camset+opt").unwrap()
     };
