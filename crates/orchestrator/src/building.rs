@@ -100,7 +100,7 @@ pub fn build_scene(
     }
     session.remember(name, &passes.run);
     match pass {
-        Pass::Done(outcome) => Ok(outcome),
+        Pass::Done(outcome) => outcome,
         Pass::Left(..) => anyhow::bail!("the last pass did not stay: this is a bug"),
     }
 }
@@ -118,8 +118,8 @@ struct Passes<'a, Export> {
 
 /// What a pass came to.
 enum Pass {
-    /// Its scene stays.
-    Done(BuildOutcome),
+    /// Its scene stays, if it could be used.
+    Done(Result<BuildOutcome>),
     /// What its model leaves apart, and the images for another pass.
     Left(LeftApart, Vec<SourceImage>),
 }
@@ -135,7 +135,7 @@ impl<Export: FnMut(&Built) -> Result<()>> Passes<'_, Export> {
         graph.want(jobs.left_apart);
         jobs.features.iter().for_each(|features| graph.want(*features));
         let (before, export) = (&self.run, &mut self.export);
-        let use_results = |executor: &Executor<'_>, run: &RunResult| {
+        let use_results = |executor: &Executor<'_>, run: &RunResult| -> Result<Pass> {
             if let Some(left) = executor.load_made::<LeftApart>(jobs.left_apart)?.filter(|left| !stays(left))
             {
                 let again = jobs.looked_at_again(images, &left);
@@ -146,11 +146,11 @@ impl<Export: FnMut(&Built) -> Result<()>> Passes<'_, Export> {
             if let BuildOutcome::Built(built) = &outcome {
                 export(built)?;
             }
-            Ok(Pass::Done(outcome))
+            Ok(Pass::Done(Ok(outcome)))
         };
         let (run, pass) = self.session.run_with(name, &graph, use_results)?;
         self.run.absorb(run);
-        pass
+        Ok(pass.unwrap_or_else(|error| Pass::Done(Err(error))))
     }
 }
 
