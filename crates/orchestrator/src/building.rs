@@ -84,7 +84,7 @@ pub fn build_scene(
     let (calibrated, first) = estimate_cameras(session, name, &folder.images, &alike, config, seed)?;
     let images = calibrated.as_deref().unwrap_or(&folder.images);
     let mut passes = Passes { session, source, alike: &alike, run: before.and(first), export };
-    let mut pass = passes.pass(images, |left| !(config.second_look.enabled && left.is_torn()))?;
+    let mut pass = passes.pass(images, |left| !config.looks_again(left))?;
     if let Pass::Left(first, again) = &pass {
         session.note(format!(
             "{} of {} images are apart from the largest component and looked at once more (second_look)",
@@ -171,8 +171,7 @@ pub fn images_of_second_pass(
     graph.want(jobs.left_apart);
     session.run(name, &graph, |executor, _| {
         let left = executor.load_made::<LeftApart>(jobs.left_apart)?;
-        let left = left.filter(|left| config.second_look.enabled && left.is_torn());
-        Ok(left.map(|left| jobs.looked_at_again(images, &left)))
+        Ok(left.filter(|left| config.looks_again(left)).map(|left| jobs.looked_at_again(images, &left)))
     })
 }
 

@@ -10,6 +10,7 @@ use setloc_camset::{CamsetParams, GrowthParams, SingleParams};
 use setloc_index::IndexParams;
 use setloc_sfm::{AlignmentParams, GeoregisterParams, MapperParams, QualityParams, TwoViewParams};
 
+use crate::artifacts::LeftApart;
 use crate::error::Hinted;
 use crate::stages::{FeatureParams, MatchParams};
 
@@ -107,6 +108,11 @@ impl Config {
     /// How features of query photos are extracted.
     pub fn photo_features(&self) -> FeatureParams {
         FeatureParams { simulated_tilt: self.photos.simulated_tilt, ..self.features.clone() }
+    }
+
+    /// Whether the images that a first model of the scene leaves apart are looked at once more.
+    pub fn looks_again(&self, left: &LeftApart) -> bool {
+        self.second_look.enabled && left.is_torn()
     }
 
     /// How features of images are extracted that a first model of the scene leaves apart.

@@ -4,7 +4,7 @@ use std::ops::Range;
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::kernel::TwoNearest;
+use super::kernel::{TwoNearest, squared_distance};
 use super::{Match, Parts, collect, match_simulated, passes};
 use crate::vectorized::{Level, vectorized};
 use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Rays};
@@ -213,9 +213,6 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Bytes of a descriptor whose squares are summed side by side.
-const LANES: usize = 32;
-
 vectorized! {
     /// Squared distances of a descriptor from some of an image's.
     fn squared_distances(query: &[u8], base: &[u8], candidates: &[u32], distances: &mut Vec<u32>) {
@@ -225,21 +222,7 @@ vectorized! {
         let Some(query) = query.first_chunk::<DESCRIPTOR_LEN>() else { return };
         let (base, _) = base.as_chunks::<DESCRIPTOR_LEN>();
         for (distance2, &candidate) in distances.iter_mut().zip(candidates) {
-            let (query, _) = query.as_chunks::<LANES>();
-            let (candidate, _) = base[candidate as usize].as_chunks::<LANES>();
-            let mut sums = [0; LANES];
-            for (query, candidate) in query.iter().zip(candidate) {
-                for ((sum, &a), &b) in sums.iter_mut().zip(query).zip(candidate) {
-                    // Differences of 16 bits are what vector registers square.
-                    let difference = i32::from(i16::from(a) - i16::from(b));
-                    *sum += difference * difference;
-                }
-            }
-            let mut total = 0;
-            for sum in sums {
-                total += sum;
-            }
-            *distance2 = total as u32;
+            *distance2 = squared_distance(query, &base[candidate as usize]);
         }
     }
 }
@@ -351,7 +334,6 @@ mod tests {
 
     use super::*;
     use crate::Keypoint;
-    use crate::matching::squared_distance;
 
     struct Pair {
         first: (ImageFeatures, Rays),

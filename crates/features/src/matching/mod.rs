@@ -180,7 +180,8 @@ impl Elevations {
 /// 45° from them, but all keypoints of the ground with each other, and all of ceilings. What is above one camera
 /// is not below the other; and how large a thing looks, relative to the sine of its elevation, is the same in both,
 /// so that keypoints up to 1.5 octaves apart in this are compared: a quarter of the work, and fewer to
-/// be confused with. All that is so in simulated views, which are squeezed along the horizon or across it. Where the strongest keypoints match otherwise the images are not level, and all are compared.
+/// be confused with. All that is so in simulated views, which are squeezed along the horizon or across it. Where the
+/// strongest keypoints match otherwise the images are not level, and all are compared.
 ///
 /// Simulated views are matched one by one, each with the other image itself, so that a keypoint does not compete in
 /// the ratio test with its own likes of other views. Of matches that say the same (both ends within

@@ -185,12 +185,11 @@ fn next_jobs<'g>(
     let images = told.as_deref().unwrap_or(&folder.images);
     let mut graph = JobGraph::default();
     add_scene(&mut graph, images, alike, config, seed)?;
-    if config.second_look.enabled && is_stored(&graph, store) {
-        let again = images_of_second_pass(&session()?, name, images, alike, config, seed)?;
-        if let Some(again) = again {
-            graph = JobGraph::default();
-            add_scene(&mut graph, &again, alike, config, seed)?;
-        }
+    if is_stored(&graph, store)
+        && let Some(again) = images_of_second_pass(&session()?, name, images, alike, config, seed)?
+    {
+        graph = JobGraph::default();
+        add_scene(&mut graph, &again, alike, config, seed)?;
     }
     Ok(graph)
 }
