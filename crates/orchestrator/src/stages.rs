@@ -36,7 +36,7 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// errors its images share. 14: and how these change the stretch of panoramas. 15: adjusted in fewer steps. 16: to first order.
 /// 17: what it may be off by its points' residuals, too. 18: warns of what is hardly held. 19: other signs. 20: in the hash of
 /// what localization depends on.
-pub const SCENE_VERSION: u32 = 20;
+pub const SCENE_VERSION: u32 = 21;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
 /// Version of set localization.

@@ -34,7 +34,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 20;
+pub const ALIGNMENT_VERSION: u32 = 21;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;

@@ -25,13 +25,27 @@ pub(super) fn distort_with_jacobian(direction: &Vector3<f64>, terms: &[f64; 4]) 
     if !is_pinhole(terms) && !is_inside(&n, terms) {
         return None;
     }
-    let inv_z = 1.0 / direction.z;
-    let d_plane = Matrix2x3::new(inv_z, 0.0, -n.x * inv_z, 0.0, inv_z, -n.y * inv_z);
     Some(Distorted {
         point: map(&n, terms),
-        d_direction: jacobian(&n, terms) * d_plane,
+        d_direction: jacobian(&n, terms) * d_plane(direction, &n),
         d_distortion: d_terms(&n),
     })
+}
+
+/// [`distort_with_jacobian`] of no more than ∂point / ∂direction.
+pub(super) fn d_direction(direction: &Vector3<f64>, terms: &[f64; 4]) -> Option<Matrix2x3<f64>> {
+    let n = focal_plane(direction)?;
+    let slope = jacobian(&n, terms);
+    if !is_pinhole(terms) && !Domain::new(terms).contains(&n, || slope) {
+        return None;
+    }
+    Some(slope * d_plane(direction, &n))
+}
+
+/// ∂(x/z, y/z) / ∂direction.
+fn d_plane(direction: &Vector3<f64>, n: &Vector2<f64>) -> Matrix2x3<f64> {
+    let inv_z = 1.0 / direction.z;
+    Matrix2x3::new(inv_z, 0.0, -n.x * inv_z, 0.0, inv_z, -n.y * inv_z)
 }
 
 pub(super) fn undistort_with_jacobian(point: &Vector2<f64>, terms: &[f64; 4]) -> Option<Undistorted> {
@@ -115,15 +129,35 @@ fn domain_end(k1: f64, k2: f64) -> f64 {
 }
 
 fn is_inside(n: &Vector2<f64>, terms: &[f64; 4]) -> bool {
-    let &[k1, k2, p1, p2] = terms;
-    if n.norm_squared() > domain_end(k1, k2) {
-        return false;
+    Domain::new(terms).contains(n, || jacobian(n, terms))
+}
+
+/// The disc in which the radial curve grows, and whether tangential terms may turn the map over inside it.
+struct Domain {
+    end: f64,
+    is_tangential: bool,
+}
+
+impl Domain {
+    fn new(&[k1, k2, p1, p2]: &[f64; 4]) -> Self {
+        Self { end: domain_end(k1, k2), is_tangential: p1 != 0.0 || p2 != 0.0 }
     }
-    if p1 == 0.0 && p2 == 0.0 {
-        return true;
+
+    /// Whether a place is inside; `jacobian` is the map's there.
+    fn contains(&self, n: &Vector2<f64>, jacobian: impl FnOnce() -> Matrix2<f64>) -> bool {
+        n.norm_squared() <= self.end
+            && (!self.is_tangential || {
+                let j = jacobian();
+                j.trace() > 0.0 && j.determinant() > MIN_SLOPE * MIN_SLOPE
+            })
     }
-    let j = jacobian(n, terms);
-    j.trace() > 0.0 && j.determinant() > MIN_SLOPE * MIN_SLOPE
+}
+
+/// By how much radii are stretched about a squared distorted radius, where that is little: near enough for the first of Newton's
+/// steps.
+fn mild_share(squared: f64, k1: f64, k2: f64) -> Option<f64> {
+    let share = 1.0 + squared * (k1 + squared * k2);
+    (0.7..1.3).contains(&share).then_some(share)
 }
 
 /// The radius whose distorted radius is `distorted`.
@@ -142,7 +176,9 @@ fn invert_radius(distorted: f64, k1: f64, k2: f64) -> Option<f64> {
     }
     // Far out the highest power is all there is; Newton from the distorted radius would need a step for each fifth.
     let squared = distorted * distorted;
-    let far = if k2 > 0.0 && k2 * squared * squared > 1.0 {
+    let far = if let Some(share) = mild_share(squared, k1, k2) {
+        distorted / share
+    } else if k2 > 0.0 && k2 * squared * squared > 1.0 {
         (distorted / k2).powf(0.2)
     } else if k2 <= 0.0 && k1 * squared > 1.0 {
         (distorted / k1).cbrt()
@@ -157,7 +193,7 @@ fn invert(point: &Vector2<f64>, terms: &[f64; 4]) -> Option<Vector2<f64>> {
     if is_pinhole(terms) {
         return Some(*point);
     }
-    let &[k1, k2, p1, p2] = terms;
+    let &[k1, k2, ..] = terms;
     let distorted = point.norm();
     if !distorted.is_finite() {
         return None;
@@ -165,39 +201,50 @@ fn invert(point: &Vector2<f64>, terms: &[f64; 4]) -> Option<Vector2<f64>> {
     if distorted == 0.0 {
         return Some(Vector2::zeros());
     }
-    let tangential = p1 != 0.0 || p2 != 0.0;
-    let radius = match invert_radius(distorted, k1, k2) {
-        Some(radius) => radius,
+    let domain = Domain::new(terms);
+    if !domain.is_tangential {
+        return invert_radius(distorted, k1, k2).map(|radius| point * (radius / distorted));
+    }
+    let near = mild_share(distorted * distorted, k1, k2).map(|share| point / share);
+    near.and_then(|near| invert_from(&near, point, terms, &domain)).or_else(|| {
+        let radial = invert_radius(distorted, k1, k2);
         // Tangential terms move the border of the domain a little: start at the radial border.
-        None if tangential => 0.95 * domain_end(k1, k2).sqrt(),
-        None => return None,
-    };
-    let mut n = point * (radius / distorted);
-    if !tangential {
-        return Some(n);
-    }
-    if !is_inside(&n, terms) {
-        n *= 0.9;
-    }
-    let tolerance = 4.0 * f64::EPSILON * (1.0 + distorted);
-    let mut residual = map(&n, terms) - point;
+        let radius = radial.unwrap_or_else(|| 0.95 * domain.end.sqrt());
+        let start = point * (radius / distorted);
+        let start = if is_inside(&start, terms) { start } else { start * 0.9 };
+        invert_from(&start, point, terms, &domain)
+    })
+}
+
+/// Newton's steps to the place that is mapped to `point`, each halved until it stays in the domain and reduces the error; `None`
+/// where they end elsewhere.
+fn invert_from(
+    start: &Vector2<f64>,
+    point: &Vector2<f64>,
+    terms: &[f64; 4],
+    domain: &Domain,
+) -> Option<Vector2<f64>> {
+    let tolerance = 4.0 * f64::EPSILON * (1.0 + point.norm());
+    let (mut n, mut slope, mut residual) = (*start, jacobian(start, terms), map(start, terms) - point);
     for _ in 0..MAX_ITERATIONS {
-        let step = jacobian(&n, terms).try_inverse()? * residual;
-        // Steps are halved until they stay in the domain and reduce the error; near the end rounding stops them.
+        if residual.norm() <= tolerance {
+            break;
+        }
+        let step = slope.try_inverse()? * residual;
         let mut scale = 1.0;
         let next = loop {
             let candidate = n - step * scale;
-            let candidate_residual = map(&candidate, terms) - point;
-            if is_inside(&candidate, terms) && candidate_residual.norm() < residual.norm() {
-                break Some((candidate, candidate_residual));
+            let (there, left) = (jacobian(&candidate, terms), map(&candidate, terms) - point);
+            if domain.contains(&candidate, || there) && left.norm() < residual.norm() {
+                break Some((candidate, there, left));
             }
             scale *= 0.5;
             if scale < 1e-6 {
                 break None;
             }
         };
-        let Some((candidate, candidate_residual)) = next else { break };
-        (n, residual) = (candidate, candidate_residual);
+        let Some(next) = next else { break };
+        (n, slope, residual) = next;
     }
-    (residual.norm() <= tolerance * 16.0 && is_inside(&n, terms)).then_some(n)
+    (residual.norm() <= tolerance * 16.0 && domain.contains(&n, || slope)).then_some(n)
 }

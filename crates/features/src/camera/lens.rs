@@ -79,6 +79,14 @@ impl Lens {
         }
     }
 
+    /// ∂point / ∂direction alone.
+    pub fn d_direction(self, direction: &Vector3<f64>, terms: &[f64; 4]) -> Option<Matrix2x3<f64>> {
+        match self {
+            Self::Brown => brown::d_direction(direction, terms),
+            _ => self.distort_with_jacobian(direction, terms).map(|distorted| distorted.d_direction),
+        }
+    }
+
     pub fn undistort_with_jacobian(self, point: &Vector2<f64>, terms: &[f64; 4]) -> Option<Undistorted> {
         match self {
             Self::Brown => brown::undistort_with_jacobian(point, terms),

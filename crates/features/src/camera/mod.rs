@@ -90,8 +90,13 @@ pub struct UnprojectJacobian {
 impl UnprojectJacobian {
     /// The angle in radians that one pixel spans, the root mean square over the two axes.
     pub fn pixel_angle(&self) -> f64 {
-        (self.d_pixel.norm_squared() / 2.0).sqrt()
+        pixel_angle(&self.d_pixel)
     }
+}
+
+/// The angle that one pixel spans, by ∂bearing / ∂pixel.
+fn pixel_angle(d_pixel: &Matrix3x2<f64>) -> f64 {
+    (d_pixel.norm_squared() / 2.0).sqrt()
 }
 
 /// A unit ray of a panorama before it is stretched, and how it moves with the pixel.
@@ -302,11 +307,16 @@ impl Camera {
 
     /// [`Camera::unproject`] and [`Camera::pixel_angle`] of a pixel in one, which spares inverting the distortion twice.
     pub fn ray(&self, pixel: &Vector2<f64>) -> Option<(Vector3<f64>, f64)> {
-        let ray = match self.model {
-            CameraModel::Equirectangular => return self.unproject(pixel).zip(self.pixel_angle(pixel)),
-            CameraModel::StitchedEquirectangular => self.unproject_plain(&self.plain_ray(pixel)?),
-            _ => self.unproject_with_jacobian(pixel)?,
-        };
+        if let Some((lens, k)) = self.lens() {
+            let ray = lens.undistort_with_jacobian(&k.normalize(pixel), &k.distortion)?;
+            let [d_x, d_y] = [0, 1].map(|axis| ray.d_point.column(axis) / k.focal[axis]);
+            let is_finite = ray.bearing.iter().all(|value| value.is_finite());
+            return is_finite.then(|| (ray.bearing, pixel_angle(&Matrix3x2::from_columns(&[d_x, d_y]))));
+        }
+        if !self.is_stretched() {
+            return self.unproject(pixel).zip(self.pixel_angle(pixel));
+        }
+        let ray = self.unproject_plain(&self.plain_ray(pixel)?);
         Some((ray.bearing, ray.pixel_angle()))
     }
 
@@ -326,7 +336,7 @@ impl Camera {
     /// distortion.
     pub fn pixel_angle_towards(&self, direction: &Vector3<f64>) -> Option<f64> {
         let Some((lens, k)) = self.lens() else { return self.pixel_angle(&self.project(direction)?) };
-        let by_direction = lens.distort_with_jacobian(direction, &k.distortion)?.d_direction;
+        let by_direction = lens.d_direction(direction, &k.distortion)?;
         let (x, y) = (by_direction.row(0) * k.focal.x, by_direction.row(1) * k.focal.y);
         // Its pseudo-inverse P⁺ is ∂bearing/∂pixel, and ‖P⁺‖² the trace of (P Pᵀ)⁻¹.
         let (xx, xy, yy) = (x.dot(&x), x.dot(&y), y.dot(&y));

@@ -166,10 +166,10 @@ impl Chunk {
         }
     }
 
-    /// Sets the candidate points and sums, for a camera-side step that solves the system of damping λ.
+    /// Sets the candidate points, stretched, and the sums as they are, for a camera-side step that solves the system of damping λ.
     pub fn substitute(
         &mut self,
-        lambda: f64,
+        (lambda, stretch): (f64, f64),
         step: &[f64],
         points: &[Vector3<f64>],
         couplings: &Couplings,
@@ -190,7 +190,7 @@ impl Chunk {
             }
             let [d0, d1, d2] = backward(&factor, forward(&factor, right));
             let delta = Vector3::new(-d0, -d1, -d2);
-            self.candidate[index] = points[point] + delta;
+            self.candidate[index] = points[point] + delta * stretch;
             for (k, diagonal) in [v[0], v[2], v[5]].into_iter().enumerate() {
                 self.sums.predicted += 0.5 * delta[k] * (lambda * bounded(diagonal) * delta[k] - g[k]);
             }

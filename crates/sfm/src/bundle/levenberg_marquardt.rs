@@ -11,6 +11,10 @@ const INITIAL_LAMBDA: f64 = 1e-4;
 const MIN_LAMBDA: f64 = 1e-10;
 /// Damping at which no useful step is left.
 const MAX_LAMBDA: f64 = 1e16;
+/// Times its length that a step is stretched by at the most.
+const MAX_STRETCH: f64 = 4.0;
+/// Share of the cost that a step takes off, below which the next may be stretched; before, it might end in another valley.
+const NEAR: f64 = 0.01;
 
 /// Why the iterations ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -81,12 +85,17 @@ impl Outcome {
 ///
 /// Damping λ·diag(JᵀJ), which makes the steps independent of the units of the unknowns. λ follows the ratio of actual
 /// to predicted decrease: H. B. Nielsen, "Damping Parameter in Marquardt's Method", IMM-REP-1999-05.
+///
+/// Under a robust loss ρ the quadratic model leaves out ρ″ < 0, and with it up to nine tenths of its curvature is too much along
+/// what is weakly determined: steps fall short there, and many follow each other along the same line. What a step took off the
+/// cost tells the curvature along it; the next is stretched by that, as gradient steps are by J. Barzilai, J. M. Borwein,
+/// "Two-Point Step Size Gradient Methods", IMA J. Numer. Anal. 1988. One that raises the cost so is taken as it is.
 pub(super) fn minimize<const D: usize, M: Model<D>>(
     model: &mut M,
     equations: &mut NormalEquations<D>,
     limits: &Limits,
 ) -> Outcome {
-    let (mut lambda, mut growth) = (INITIAL_LAMBDA, 2.0);
+    let (mut lambda, mut growth, mut stretch) = (INITIAL_LAMBDA, 2.0, 1.0);
     let mut cost = equations.linearize(model, lambda);
     let mut outcome = Outcome::new(cost, Termination::IterationLimit);
     if !cost.is_finite() {
@@ -95,7 +104,14 @@ pub(super) fn minimize<const D: usize, M: Model<D>>(
     }
     while outcome.iterations < limits.max_iterations {
         outcome.iterations += 1;
-        let step = if equations.factorize(lambda) { equations.solve(lambda, model) } else { None };
+        let mut step = None;
+        if equations.factorize(lambda) && equations.solve() {
+            step = equations.propose(lambda, stretch, model);
+            if stretch > 1.0 && !step.is_some_and(|(_, candidate)| candidate < cost) {
+                stretch = 1.0;
+                step = equations.propose(lambda, stretch, model);
+            }
+        }
         if let Some((sums, candidate)) = step {
             // Below this neither the costs' difference nor the decision by it means anything.
             if sums.predicted <= f64::EPSILON * cost {
@@ -107,6 +123,8 @@ pub(super) fn minimize<const D: usize, M: Model<D>>(
             if candidate < cost {
                 let decrease = cost - candidate;
                 let ratio = decrease / sums.predicted;
+                let is_near = decrease <= NEAR * cost;
+                stretch = if is_near { stretch_after(stretch, ratio) } else { 1.0 };
                 model.accept();
                 equations.accept();
                 outcome.accepted += 1;
@@ -140,4 +158,30 @@ pub(super) fn minimize<const D: usize, M: Model<D>>(
         outcome.truncated_steps = system.truncated();
     }
     outcome
+}
+
+/// By how much a step is stretched after one stretched by `stretch` that took `ratio` times what was predicted of it unstretched.
+///
+/// Along a step d of the model's curvature h, a stretch s takes d h d (s − ½ c s²) off, for a true curvature c h, and
+/// ½ d h d is what was predicted for s = 1.
+fn stretch_after(stretch: f64, ratio: f64) -> f64 {
+    let curvature = (2.0 * stretch - ratio) / (stretch * stretch);
+    if curvature * MAX_STRETCH > 1.0 { curvature.recip().max(1.0) } else { MAX_STRETCH }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stretched_step_ends_where_a_parabola_does() {
+        for curvature in [0.3, 0.5, 0.9] {
+            for stretch in [1.0, 1.5, 4.0] {
+                let ratio = 2.0 * stretch - curvature * stretch * stretch;
+                assert!((stretch_after(stretch, ratio) - 1.0 / curvature).abs() < 1e-12);
+            }
+        }
+        assert_eq!(stretch_after(1.0, 0.5), 1.0, "a step that was too long is not shortened");
+        assert_eq!(stretch_after(1.0, 2.5), MAX_STRETCH, "where the cost bends down");
+    }
 }

@@ -135,6 +135,8 @@ pub(super) struct NormalEquations<const D: usize> {
     /// S in the blocks of the pattern; of an implicit S only the diagonal blocks are what they say.
     schur: Vec<f64>,
     step: Vec<f64>,
+    /// The step as it was proposed last.
+    stretched: Vec<f64>,
     damping: Vec<f64>,
     /// λ for which the points are eliminated.
     eliminated_for: Option<f64>,
@@ -275,6 +277,7 @@ impl<const D: usize> NormalEquations<D> {
             gradient: vec![0.0; pattern.size()],
             schur: vec![0.0; pattern.len()],
             step: vec![0.0; pattern.size()],
+            stretched: Vec::new(),
             damping: vec![0.0; pattern.size()],
             pattern,
             chunks,
@@ -487,12 +490,8 @@ impl<const D: usize> NormalEquations<D> {
         }
     }
 
-    /// The damped step after [`NormalEquations::factorize`] with the same λ, and what it leads to; `None` when there is
-    /// none.
-    ///
-    /// The model's candidate and the candidate points are set; the cost of a candidate that is no valid state is
-    /// infinite.
-    pub fn solve<M: Model<D>>(&mut self, lambda: f64, model: &mut M) -> Option<(StepSums, f64)> {
+    /// Finds the camera side of the damped step, after [`NormalEquations::factorize`]; false when there is none.
+    pub fn solve(&mut self) -> bool {
         for (step, gradient) in self.step.iter_mut().zip(&self.gradient) {
             *step = -gradient;
         }
@@ -501,37 +500,43 @@ impl<const D: usize> NormalEquations<D> {
                 *step += reduced;
             }
         }
-        let Self {
-            observation_starts: starts,
-            couplings,
-            points,
-            pattern,
-            chunks,
-            step,
-            base,
-            damping,
-            eliminated_for,
-            system,
-            ..
-        } = self;
-        if !step.is_empty() {
-            match system {
-                ReducedSystem::Direct(system) => system.solve(step),
-                ReducedSystem::Iterative(system) => {
-                    // Products go where the elimination left the right-hand side.
-                    *eliminated_for = None;
-                    let schur = ImplicitSchur { couplings, pattern, base, damping };
-                    let multiply = |x: &[f64], to: &mut [f64]| schur.multiply::<D>(chunks, x, to);
-                    if !system.solve(pattern, step, multiply) {
-                        return None;
-                    }
-                }
+        let Self { couplings, pattern, chunks, step, base, damping, eliminated_for, system, .. } = self;
+        if step.is_empty() {
+            return true;
+        }
+        match system {
+            ReducedSystem::Direct(system) => {
+                system.solve(step);
+                true
+            }
+            ReducedSystem::Iterative(system) => {
+                // Products go where the elimination left the right-hand side.
+                *eliminated_for = None;
+                let schur = ImplicitSchur { couplings, pattern, base, damping };
+                let multiply = |x: &[f64], to: &mut [f64]| schur.multiply::<D>(chunks, x, to);
+                system.solve(pattern, step, multiply)
             }
         }
-        let is_valid = model.propose(step);
+    }
+
+    /// What the step found by [`NormalEquations::solve`] for this λ leads to, stretched; `None` when it is not finite.
+    ///
+    /// The sums are of the step as it is. The model's candidate and the candidate points are set; the cost of a candidate that
+    /// is no valid state is infinite.
+    pub fn propose<M: Model<D>>(
+        &mut self,
+        lambda: f64,
+        stretch: f64,
+        model: &mut M,
+    ) -> Option<(StepSums, f64)> {
+        let Self { observation_starts: starts, couplings, points, pattern, chunks, step, stretched, .. } =
+            self;
+        stretched.clear();
+        stretched.extend(step.iter().map(|value| value * stretch));
+        let is_valid = model.propose(stretched);
         let (model, loss) = (&*model, model.loss());
         for_each_chunk(chunks, |chunk| {
-            chunk.substitute(lambda, step, points, couplings, pattern);
+            chunk.substitute((lambda, stretch), step, points, couplings, pattern);
             let mut losses = LossSum::new(loss);
             if is_valid {
                 for (point, position) in chunk.points.clone().zip(&chunk.candidate) {

@@ -87,7 +87,8 @@ pub fn step(problem: &mut BundleProblem) -> bool {
         return false;
     }
     let Some(lambda) = LAMBDAS.into_iter().find(|&lambda| equations.factorize(lambda)) else { return false };
-    let is_valid = equations.solve(lambda, &mut model).is_some_and(|(_, candidate)| candidate.is_finite());
+    let is_valid = equations.solve()
+        && equations.propose(lambda, 1.0, &mut model).is_some_and(|(_, candidate)| candidate.is_finite());
     if is_valid {
         model.accept();
         equations.accept();

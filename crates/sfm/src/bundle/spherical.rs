@@ -131,7 +131,7 @@ impl MovedCamera {
     /// not find its way.
     fn d_log_pixel_angle(&self, bearing: &Vector3<f64>, d_bearing: &Vector3<f64>, pixel_angle: f64) -> f64 {
         let moved = self.camera.pixel_angle_towards(&(bearing + d_bearing * self.by));
-        moved.map_or(0.0, |after| (after / pixel_angle).ln() / self.by)
+        moved.map_or(0.0, |after| (after - pixel_angle) / (pixel_angle * self.by))
     }
 }
 
