@@ -23,10 +23,13 @@ fn bench(dataset: &Path) -> DatasetFigures {
 }
 
 fn bench_with(dataset: &Path, config: Config) -> DatasetFigures {
+    bench_as(dataset, &BenchOptions { config, seed: 0, gps: BenchGps::None, joint_reference: false })
+}
+
+fn bench_as(dataset: &Path, options: &BenchOptions) -> DatasetFigures {
     let store = tempfile::tempdir().unwrap();
     let session = session(store.path());
-    let options = BenchOptions { config, seed: 0, gps: BenchGps::None };
-    bench_dataset(&session, dataset, &options).unwrap()
+    bench_dataset(&session, dataset, options).unwrap()
 }
 
 fn session(store: &Path) -> Session {
@@ -73,6 +76,25 @@ fn the_town_is_mapped_and_its_set_located() {
     let figures = bench(folder.path());
     assert!(!figures.sets.is_empty());
     assert_main_job(&figures);
+}
+
+#[test]
+fn a_set_without_truth_is_compared_with_a_reconstruction_of_scene_and_photos_together() {
+    let folder = tempfile::tempdir().unwrap();
+    stages::write_sample(folder.path()).unwrap();
+    std::fs::remove_file(folder.path().join("truth.json")).unwrap();
+    let config = Config::default();
+    let options = BenchOptions { config, seed: 0, gps: BenchGps::None, joint_reference: true };
+    let figures = bench_as(folder.path(), &options);
+    let joint = figures.joint_reference.as_ref().unwrap();
+    let photos: usize = figures.sets.iter().map(|set| set.images).sum();
+    assert_eq!((joint.scene_images, joint.photos), (figures.scene.images, photos));
+    for set in &figures.sets {
+        let refined = &set.methods["camset+opt"];
+        let (position, rotation) = (refined.position_m.unwrap(), refined.rotation_deg.unwrap());
+        let share = position.median / joint.extent;
+        assert!(share < 0.005 && rotation.median < 0.2, "{}: {share} {rotation:?}", set.name);
+    }
 }
 
 #[test]

@@ -40,7 +40,9 @@ pub fn about(truth: TruthKind, licence: &str) -> String {
     let truth = match truth {
         TruthKind::Exact => "Truth: exact (rendered).",
         TruthKind::Measured => "Truth: measured.",
-        TruthKind::None => "No truth: only registration is counted.",
+        TruthKind::None => {
+            "No truth: photos are compared with a reconstruction of scene and photos together."
+        }
     };
     format!("{truth} Licence: {licence}.")
 }

@@ -96,13 +96,14 @@ pub fn figures_section(figures: &DatasetFigures) -> String {
         let errors = of_sets.flat_map(|of_set| registered_errors(of_set).map(|(_, error)| error)).collect();
         Recall { label: (*method).to_owned(), errors, total: photos }
     };
+    let unit = if figures.joint_reference.is_some() { "units" } else { "m" };
     text += &recall_curves(
         "Photos within a position error",
-        "m",
+        unit,
         &METHODS.iter().map(of_method).collect::<Vec<_>>(),
     );
     for set in &figures.sets {
-        text += &set_plot(set);
+        text += &set_plot(set, unit);
     }
     let stages: Vec<(String, f64)> =
         figures.stages.iter().map(|stage| (stage.name.clone(), stage.cpu_s)).collect();
@@ -115,7 +116,7 @@ fn registered_errors(figures: &MethodFigures) -> impl Iterator<Item = (&str, f64
     registered.filter_map(|photo| Some((photo.name.as_str(), figures.errors.get(&photo.name)?.position_m)))
 }
 
-fn set_plot(set: &SetFigures) -> String {
+fn set_plot(set: &SetFigures, unit: &str) -> String {
     let mut names: Vec<String> = set
         .methods
         .values()
@@ -130,5 +131,5 @@ fn set_plot(set: &SetFigures) -> String {
         Series { label: (*method).to_owned(), values }
     };
     let series: Vec<Series> = METHODS.iter().map(series).collect();
-    dots(&format!("{}: position error by photo (× not registered)", set.name), "m", &names, &series)
+    dots(&format!("{}: position error by photo (× not registered)", set.name), unit, &names, &series)
 }

@@ -9,7 +9,7 @@ use super::DatasetFigures;
 pub enum MetricKind {
     /// A number of registered images: more is better.
     Registered,
-    /// A distance in metres: less is better.
+    /// A distance in metres, or in percent of a scene's extent: less is better.
     Position,
     /// An angle in degrees: less is better.
     Rotation,
@@ -23,7 +23,7 @@ impl MetricKind {
     /// Of a metric's name.
     pub fn of(name: &str) -> Self {
         match name.rsplit('/').next().unwrap_or_default() {
-            last if last.ends_with("_m") => Self::Position,
+            last if last.ends_with("_m") || last.ends_with("_of_extent") => Self::Position,
             last if last.ends_with("_deg") => Self::Rotation,
             last if last.ends_with("_s") => Self::Time,
             last if last.starts_with("auc") || last.ends_with("_percent") => Self::Percent,
@@ -99,6 +99,11 @@ fn flatten(figures: &DatasetFigures) -> Vec<(String, f64)> {
     for (threshold, area) in scene.auc.iter().flatten() {
         flat.push((format!("scene/auc@{threshold}"), *area));
     }
+    // Units of a joint reconstruction say nothing by themselves.
+    let (units, suffix) = match &figures.joint_reference {
+        None => (1.0, "m"),
+        Some(joint) => (100.0 / joint.extent, "percent_of_extent"),
+    };
     for set in &figures.sets {
         for (method, of_method) in &set.methods {
             let mut add =
@@ -106,14 +111,14 @@ fn flatten(figures: &DatasetFigures) -> Vec<(String, f64)> {
             add("registered", of_method.registered as f64);
             add("target_registered", f64::from(u8::from(of_method.target_registered)));
             if let Some(bounds) = of_method.position_m {
-                add("median_m", bounds.median);
-                add("max_m", bounds.max);
+                add(&format!("median_{suffix}"), units * bounds.median);
+                add(&format!("max_{suffix}"), units * bounds.max);
             }
             if let Some(bounds) = of_method.rotation_deg {
                 add("median_deg", bounds.median);
             }
             if let Some(error) = of_method.target {
-                add("target_m", error.position_m);
+                add(&format!("target_{suffix}"), units * error.position_m);
                 add("target_deg", error.rotation_deg);
             }
         }
@@ -147,6 +152,7 @@ mod tests {
     #[test]
     fn a_metric_s_name_says_its_kind() {
         assert_eq!(MetricKind::of("south/camset+opt/target_m"), MetricKind::Position);
+        assert_eq!(MetricKind::of("back/camset+opt/median_percent_of_extent"), MetricKind::Position);
         assert_eq!(MetricKind::of("scene/median_deg"), MetricKind::Rotation);
         assert_eq!(MetricKind::of("scene/auc@0.5"), MetricKind::Percent);
         assert_eq!(MetricKind::of("camset+opt/within_95_percent"), MetricKind::Percent);

@@ -9,8 +9,8 @@ use setloc_sfm::{PoseDeviation, Reconstruction, Rigid};
 
 use super::figures::{mean_angular_error_px, own_rotation_errors_deg};
 use super::{
-    AUC_THRESHOLDS_DEG, Alignment, Bounds, Calibration, Errors, NormalizedError, PoseError, SceneFigures,
-    auc_percent,
+    AUC_THRESHOLDS_DEG, Alignment, Bounds, Calibration, Errors, JointReference, NormalizedError, PoseError,
+    SceneFigures, auc_percent,
 };
 use crate::building::{BuildOutcome, Built, SceneSource, build_scene};
 use crate::config::Config;
@@ -32,6 +32,8 @@ pub struct BenchOptions {
     pub seed: u64,
     /// Whether the scene uses `geo.csv` or EXIF positions.
     pub gps: BenchGps,
+    /// Whether photos that no truth tells of are compared with a reconstruction of everything together.
+    pub joint_reference: bool,
 }
 
 /// Positions given to the scene.
@@ -99,9 +101,12 @@ pub struct DatasetFigures {
     pub dataset: String,
     /// The scene.
     pub scene: SceneFigures,
-    /// The sets.
+    /// The sets. Errors are in metres where a truth is known, else in units of the joint reconstruction.
     pub sets: Vec<SetFigures>,
-    /// Time by stage.
+    /// What photos are compared with that no truth tells of.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub joint_reference: Option<JointReference>,
+    /// Time by stage, without the joint reconstruction.
     pub stages: Vec<StageReport>,
     /// Most memory held, in MiB.
     pub peak_rss_mb: f64,
@@ -165,7 +170,6 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     let estimated = poses_of(&model);
     let true_scene = truth_of(truth.as_ref(), &format!("{kind}/"));
     let alignment = Alignment::of_centres(&estimated, &true_scene);
-    let alignments = alignments_of(&built.scene, &true_scene);
     let scene_errors = alignment.as_ref().map_or_else(Errors::new, |a| errors_of(a, &estimated, &true_scene));
     let scene = scene_figures(
         files.len(),
@@ -176,7 +180,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         alignment.as_ref(),
         &scene_errors,
     );
-    let mut sets = Vec::new();
+    let mut found = Vec::new();
     let mut skipped = built.skipped.clone();
     let mut skipped_sets = BTreeMap::new();
     let mut warnings = folder.warnings.clone();
@@ -204,6 +208,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
             config: options.config.clone(),
             seed: options.seed,
         };
+        let as_read = photos.clone();
         let located = locate(session, &mut photos, &what, Mode::Both, &run_name(&set), &target)?;
         if located.skipped.len() == files.len() {
             let reasons: Vec<String> =
@@ -213,16 +218,32 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         }
         skipped.extend(located.skipped.clone());
         warnings.extend(photos.warnings);
-        let true_photos = truth_of(truth.as_ref(), &format!("queries/{name}/"));
-        sets.push(set_figures(name, files.len(), target, located, &alignments, &true_photos));
+        found.push(LocatedSet { name, images: files.len(), target, located, photos: as_read });
     }
     let (wall_s, cpu_s) = session.report.totals();
+    let (stages, peak_rss_mb) = (session.report.stages(), crate::clock::peak_rss_mib());
+    let is_told = truth.as_ref().is_some_and(|truth| truth.names("queries/").next().is_some());
+    let joint_reference = if options.joint_reference && !is_told && !found.is_empty() {
+        let photos: Vec<ImageFolder> = found.iter().map(|set| set.photos.clone()).collect();
+        let name = run_name(&root.join("joint"));
+        Some(JointReference::build(session, &folder, &photos, options, &name)?)
+    } else {
+        None
+    };
+    let reference = joint_reference.as_ref().map(|joint| &joint.poses);
+    let alignments = alignments_of(&built.scene, reference.unwrap_or(&true_scene));
+    let sets = found.into_iter().map(|set| {
+        let of_truth = truth_of(truth.as_ref(), &format!("queries/{}/", set.name));
+        set_figures(set, &alignments, reference.unwrap_or(&of_truth))
+    });
+    let sets = sets.collect();
     Ok(DatasetFigures {
         dataset: root.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
         scene,
         sets,
-        stages: session.report.stages(),
-        peak_rss_mb: crate::clock::peak_rss_mib(),
+        joint_reference,
+        stages,
+        peak_rss_mb,
         wall_s,
         cpu_s,
         gps: format!("{:?}", options.gps).to_lowercase(),
@@ -266,7 +287,7 @@ fn truth_of(truth: Option<&Truth>, prefix: &str) -> BTreeMap<String, Rigid> {
     truth.names(prefix).filter_map(|name| Some((name.to_owned(), truth.pose(name)?))).collect()
 }
 
-fn poses_of(model: &Reconstruction) -> BTreeMap<String, Rigid> {
+pub(super) fn poses_of(model: &Reconstruction) -> BTreeMap<String, Rigid> {
     model.images.iter().filter_map(|image| Some((image.name.clone(), image.world_from_camera?))).collect()
 }
 
@@ -321,11 +342,18 @@ fn scene_figures(
     }
 }
 
-fn set_figures(
+/// A set and what came out.
+struct LocatedSet {
     name: String,
     images: usize,
     target: String,
     located: Located,
+    /// The photos with what was known of them before.
+    photos: ImageFolder,
+}
+
+fn set_figures(
+    LocatedSet { name, images, target, located, .. }: LocatedSet,
     alignments: &[Option<Alignment>],
     truth: &BTreeMap<String, Rigid>,
 ) -> SetFigures {

@@ -1,5 +1,6 @@
 use super::{
-    AUC_THRESHOLDS_DEG, Bounds, Calibration, DatasetFigures, MethodFigures, NormalizedError, SetFigures,
+    AUC_THRESHOLDS_DEG, Bounds, Calibration, DatasetFigures, JointReference, MethodFigures, NormalizedError,
+    PoseError, SetFigures,
 };
 use crate::text::add;
 
@@ -27,12 +28,19 @@ pub fn markdown_tables(figures: &DatasetFigures) -> String {
                 add(&mut text, format_args!(" {registered}/{}{apart} | {rate:.2} % |", set.images));
             }
         }
-        text += "\n\n## Location error (m / deg)\n\nOver the registered photos, after aligning each component of the scene to the truth by its images' centres (few or in a line: by their rotations, too).\n\n";
+        text += "\n\n## Location error (";
+        match &figures.joint_reference {
+            None => {
+                text += "m / deg)\n\nOver the registered photos, after aligning each component of the scene to the truth by its images' centres (few or in a line: by their rotations, too).\n\n";
+            }
+            Some(joint) => joint_heading(&mut text, joint),
+        }
         text += "| set | method | #reg./#total | min | median | max | mean | target |\n|---|---|---|---|---|---|---|---|\n";
+        let units = figures.joint_reference.as_ref().map_or(1.0, |joint| 100.0 / joint.extent);
         for set in &figures.sets {
             for method in METHODS {
                 if let Some(figures) = set.methods.get(method) {
-                    error_row(&mut text, set, method, figures);
+                    error_row(&mut text, (set, method), figures, units);
                 }
             }
         }
@@ -100,19 +108,39 @@ fn scene_table(text: &mut String, figures: &DatasetFigures) {
     }
 }
 
-fn error_row(text: &mut String, set: &SetFigures, method: &str, figures: &MethodFigures) {
+/// What the location errors are against where there is no truth.
+fn joint_heading(text: &mut String, joint: &JointReference) {
+    let &JointReference { scene_images, photos, of_photos, .. } = joint;
+    *text += "% of the scene's extent / deg)\n\n";
+    add(
+        text,
+        format_args!(
+            "No truth: against a reconstruction of scene and photos together, which holds {photos} of {of_photos} photos beside {scene_images} images of the scene"
+        ),
+    );
+    *text += if joint.is_usable() {
+        ". Over the registered photos, after aligning each component of the scene to it; how far both are off it does not tell.\n\n"
+    } else {
+        ": too few to compare with.\n\n"
+    };
+}
+
+/// `units` are those of the table in one of the errors.
+fn error_row(text: &mut String, (set, method): (&SetFigures, &str), figures: &MethodFigures, units: f64) {
     add(text, format_args!("| {} | {method} | {}/{} |", set.name, figures.registered, set.images));
     let parts: [fn(&Bounds) -> f64; 4] = [|b| b.min, |b| b.median, |b| b.max, |b| b.mean];
     for part in parts {
         match figures.position_m.as_ref().zip(figures.rotation_deg.as_ref()) {
             Some((position, rotation)) => {
-                add(text, format_args!(" {:.3}/{:.3} |", part(position), part(rotation)));
+                add(text, format_args!(" {:.3}/{:.3} |", units * part(position), part(rotation)));
             }
             None => *text += " - |",
         }
     }
     match figures.target {
-        Some(error) => add(text, format_args!(" {:.3}/{:.3} |\n", error.position_m, error.rotation_deg)),
+        Some(PoseError { position_m, rotation_deg }) => {
+            add(text, format_args!(" {:.3}/{rotation_deg:.3} |\n", units * position_m));
+        }
         None if figures.target_registered => *text += " registered |\n",
         None => *text += " - |\n",
     }
@@ -129,7 +157,14 @@ fn calibration_table(text: &mut String, figures: &DatasetFigures) {
     if rows.is_empty() {
         return;
     }
-    *text += "\n## Stated uncertainty\n\nRegistered photos whose true centre lies in the stated 95 % ellipsoid, and mean squared error per coordinate in what\nthe covariance states (1 where it states the truth).\n\n";
+    let whose =
+        if figures.joint_reference.is_some() { "centre in the joint reconstruction" } else { "true centre" };
+    add(
+        text,
+        format_args!(
+            "\n## Stated uncertainty\n\nRegistered photos whose {whose} lies in the stated 95 % ellipsoid, and mean squared error per coordinate in what\nthe covariance states (1 where it states the truth).\n\n"
+        ),
+    );
     *text += "| set | method | within 95 % | centre | rotation |\n|---|---|---|---|---|\n";
     for (set, method, Calibration { photos, within_95, mean }) in rows {
         let NormalizedError { position, rotation } = mean;

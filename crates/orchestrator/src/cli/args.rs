@@ -215,6 +215,9 @@ pub struct BenchArgs {
     /// Runs with as many seeds, from --seed on
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub repeats: u64,
+    /// Do not compare photos of data sets without truth with a reconstruction of scene and photos together
+    #[arg(long)]
+    pub no_joint_reference: bool,
     /// Options of the run; without --cache nothing is reused, so that times are those of the whole work
     #[command(flatten)]
     pub run: RunArgs,

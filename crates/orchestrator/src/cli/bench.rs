@@ -141,7 +141,9 @@ fn repeat(
         let output =
             if seed == args.run.seed { output.to_owned() } else { output.join(format!("seed-{seed}")) };
         let session = run.session(&output, Some(&output))?;
-        let figures = bench_dataset(&session, root, &BenchOptions { config: run.config()?, seed, gps })?;
+        let joint_reference = !args.no_joint_reference;
+        let options = BenchOptions { config: run.config()?, seed, gps, joint_reference };
+        let figures = bench_dataset(&session, root, &options)?;
         for (set, reason) in &figures.skipped_sets {
             print::note(&format!("skipped set {set}: {reason}"));
         }

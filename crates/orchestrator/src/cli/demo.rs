@@ -15,7 +15,8 @@ pub fn run(args: &DemoArgs) -> Result<Answer> {
     let cache = args.run.cache.clone().unwrap_or_else(|| args.output.join(".setloc-cache"));
     let run = RunArgs { cache: Some(cache), ..args.run.clone() };
     let session = run.session(&args.output, Some(&args.output))?;
-    let options = BenchOptions { config: run.config()?, seed: run.seed, gps: BenchGps::None };
+    let options =
+        BenchOptions { config: run.config()?, seed: run.seed, gps: BenchGps::None, joint_reference: false };
     let figures = bench_dataset(&session, &town, &options)?;
     write_figures(&args.output, &figures)?;
     print::data(markdown_tables(&figures).trim_end())?;
