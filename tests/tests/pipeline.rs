@@ -16,6 +16,7 @@ use setloc_orchestrator::jobs::LocateJobs;
 use setloc_orchestrator::locating::{Mode, grow, locate};
 use setloc_orchestrator::session::{Limits, Session};
 use setloc_orchestrator::stages;
+use setloc_orchestrator::turning::guess_by_turns;
 use setloc_town::{TownParams, write_dataset};
 
 fn bench(dataset: &Path) -> DatasetFigures {
@@ -235,6 +236,23 @@ fn a_real_set_of_which_one_standpoint_sees_the_scene_gets_its_scale_from_a_facad
             *walls < 0.05 && *walls < 0.75 * keypoints,
             "{photo}: {walls} with walls, {keypoints} without"
         );
+    }
+}
+
+/// Two photos of each standpoint, of which panoramas and each other tell little.
+#[test]
+fn real_photos_turned_on_one_spot_tell_their_focal_length() {
+    let Some(dataset) = shared("lzr") else { return };
+    let store = tempfile::tempdir().unwrap();
+    let files = list_images(&[dataset.join("queries/back")]).unwrap();
+    let read = ImageFolder::read(&files, &CameraBook::default(), &GeoSource::None, None).unwrap();
+    let (mut photos, config) = (read.images, Config::default());
+    let params = (&config.photo_features(), &config);
+    guess_by_turns(&session(store.path()), "back", &mut photos, &[], params, 0).unwrap();
+    for photo in &photos {
+        let focal = photo.camera.focal_length();
+        assert!((focal / 1250.0 - 1.0).abs() < 0.005, "{}: {focal}", photo.name);
+        assert_eq!(photo.calibration, Calibration::Guessed);
     }
 }
 

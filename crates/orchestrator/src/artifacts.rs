@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use setloc_camset::{AnywhereLocalization, Growth, SetLocalization};
 use setloc_features::{ImageFeatures, Keypoint, Match, SimulatedView};
 use setloc_index::SceneIndex;
+use setloc_sfm::robust::TurnedCamera;
 use setloc_sfm::{MapperOutput, TwoView};
 
 use crate::codec::{Artifact, CodecError};
@@ -105,6 +106,10 @@ impl Artifact for PairMatches {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct VerifiedPair(pub Vec<TwoView>);
 
+/// What two images show of the focal length of their camera if it was turned on the spot between them.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct TurnedPair(pub Option<TurnedCamera>);
+
 /// For each image others that look alike, most first; empty for images that nobody asked about.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct LikelyImages(pub Vec<Vec<u32>>);
@@ -134,6 +139,7 @@ pub struct SceneIndices(pub Vec<SceneIndex>);
 serde_artifact!(LikelyImages, "likely images", 1);
 serde_artifact!(LeftApart, "images left apart", 1);
 serde_artifact!(VerifiedPair, "verified pair", 1);
+serde_artifact!(TurnedPair, "turned pair", 1);
 serde_artifact!(MapperOutput, "model", 8);
 serde_artifact!(SceneIndices, "index", 2);
 serde_artifact!(AnywhereLocalization, "photo localization", 3);

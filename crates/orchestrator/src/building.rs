@@ -19,6 +19,7 @@ use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::stages::FeatureParams;
 use crate::text::some_of;
+use crate::turning::guess_by_turns;
 
 /// A scene that was built, or found built.
 pub struct Built {
@@ -219,13 +220,21 @@ pub fn estimate_cameras(
     if !has_guessed_cameras(images) {
         return Ok((None, RunResult::default()));
     }
+    let mut images = images.to_vec();
+    // Where pairs are chosen by place, others need not be matched.
+    let by_turns = if images.iter().all(|image| image.position.is_none()) {
+        guess_by_turns(session, name, &mut images, alike, (&config.features, config), seed)?
+    } else {
+        RunResult::default()
+    };
+    let images = &images;
     let mut graph = JobGraph::default();
     let jobs = add_first_model(&mut graph, images, alike, config, seed)?;
     let (told, doubtful, first) = session.run(name, &graph, |executor, run| {
         let model = executor.load_made::<MapperOutput>(jobs.model)?;
         let doubtful = model.as_ref().is_some_and(|model| !model.report.doubtful.is_empty());
         let told = model.and_then(|model| with_estimated_cameras(images, &jobs, &model));
-        Ok((told, doubtful, run.clone()))
+        Ok((told, doubtful, by_turns.and(run.clone())))
     })?;
     let told = match told {
         Some(told) if doubtful => told,

@@ -14,7 +14,7 @@ mod scene;
 pub use grow::{LocatedJobs, add_grown};
 pub use likely::LikelyJobs;
 pub use locate::{LocateJobs, SetJobs, add_set, add_singles};
-pub use model::{ModelJobs, ModelKind, add_features_of, add_model, divided_guesses};
+pub use model::{ModelJobs, ModelKind, add_features_of, add_model, add_turned, divided_guesses};
 pub use pairs::choose_pairs;
 pub use scene::{SceneJobs, SceneModelJobs, add_first_model, add_scene};
 

@@ -32,3 +32,4 @@ pub mod stages;
 pub mod store;
 pub mod subscribers;
 pub mod text;
+pub mod turning;

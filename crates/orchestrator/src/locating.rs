@@ -18,6 +18,7 @@ use crate::jobs::{
 };
 use crate::scene::SceneFile;
 use crate::session::Session;
+use crate::turning::guess_by_turns;
 
 /// Which methods are tried.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
@@ -113,6 +114,11 @@ pub fn locate(
         located.single.iter().any(|photo| photo.name == target && photo.verdict == Verdict::Localized);
     let wanted = matches!(mode, Mode::Set | Mode::Both) || (mode == Mode::Auto && !found);
     if wanted {
+        let photos = what.config.photo_features();
+        let (alike, before) = alike_pairs(session, name, &folder.images, &photos, &what.config)?;
+        whole.absorb(before);
+        let params = (&photos, &what.config);
+        whole.absorb(guess_by_turns(session, name, &mut folder.images, &alike, params, what.seed)?);
         let lone: Vec<bool> =
             folder.images.iter().map(|image| is_lone_guess(&folder.images, image)).collect();
         if lone.contains(&true) {

@@ -20,6 +20,8 @@ pub const LIKELY_VERSION: u32 = 1;
 pub const LEFT_APART_VERSION: u32 = 1;
 /// Version of two-view verification.
 pub const VERIFY_VERSION: u32 = setloc_sfm::TWO_VIEW_VERSION;
+/// Version of focal lengths by turns on the spot.
+pub const TURNED_VERSION: u32 = 1;
 /// Version of mapping.
 pub const MAPPER_VERSION: u32 = setloc_sfm::MAPPER_VERSION;
 /// Version of the alignment of tracks.

@@ -12,6 +12,7 @@ mod ransac;
 mod ray_homography;
 mod relative_pose;
 mod residual;
+mod turned_camera;
 
 pub use absolute_pose::{AbsolutePoseEstimate, estimate_absolute_pose, refine_absolute_pose, rival_poses};
 pub use absolute_pose_focal::{AbsolutePoseFocalEstimate, estimate_absolute_pose_focal};
@@ -26,6 +27,7 @@ pub use relative_pose::{
 };
 pub(crate) use relative_pose::{estimate_level_pose, estimate_turned_pose};
 pub use residual::AngularResidual;
+pub use turned_camera::{TurnedCamera, estimate_turned_camera};
 
 use nalgebra::Vector3;
 

@@ -16,6 +16,7 @@ mod quadrics;
 mod ray_homography;
 mod rotation_quadric;
 mod solutions;
+mod turn_with_focal;
 mod ugp3ps;
 mod upright_three_point;
 
@@ -31,6 +32,7 @@ pub use p4pf::{PoseWithFocal, p4pf};
 pub use polynomial::real_roots;
 pub use ray_homography::ray_homography;
 pub use solutions::Solutions;
+pub use turn_with_focal::{TurnWithFocal, turn_with_focal};
 pub use ugp3ps::ugp3ps;
 pub use upright_three_point::upright_three_point;
 

@@ -74,7 +74,12 @@ pub fn guess_camera(info: &ImageInfo) -> (Camera, CameraSource) {
     if let Some(focal) = by_sensor.filter(plausible) {
         return (photo(focal), CameraSource::ExifFocalPlane);
     }
-    (photo(FALLBACK_FOCAL * longer), CameraSource::Fallback)
+    (fallback_camera(info.width, info.height), CameraSource::Fallback)
+}
+
+/// The camera of a photo of which nothing is known: `RADIAL` with 1.2 times the longer side.
+pub fn fallback_camera(width: u32, height: u32) -> Camera {
+    Camera::from_focal_guess(width, height, FALLBACK_FOCAL * f64::from(width.max(height)))
 }
 
 fn is_two_to_one(width: f64, height: f64) -> bool {

@@ -11,7 +11,7 @@ use image::{ImageDecoder, ImageFormat, ImageReader, Limits};
 use serde::{Deserialize, Serialize};
 
 use crate::{FeatureError, GreyImage};
-pub use guess::{CameraSource, guess_camera};
+pub use guess::{CameraSource, fallback_camera, guess_camera};
 pub use metadata::{GPano, GeoPosition, ImageMetadata};
 
 /// Limits on images, checked on the header before any pixel is allocated.

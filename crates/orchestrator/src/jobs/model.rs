@@ -5,8 +5,10 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
+use nalgebra::Vector2;
 use serde_json::json;
 use setloc_features::{Calibration, Camera, ImageFeatures, Match};
+use setloc_sfm::robust::{RansacParams, estimate_turned_camera};
 use setloc_sfm::{
     CameraId, GeoregisterParams, Georegistration, ImageId, InputImage, MapperInput, MapperOutput,
     MapperParams, MapperReport, MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction,
@@ -15,7 +17,7 @@ use setloc_sfm::{
 
 use super::alignment::add_alignment;
 use super::derived_seed;
-use crate::artifacts::{PairMatches, VerifiedPair};
+use crate::artifacts::{PairMatches, TurnedPair, VerifiedPair};
 use crate::config::Config;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
@@ -210,24 +212,10 @@ fn add_pair(
     config: &Config,
     seed: u64,
 ) -> PairJobs {
-    let name = [&images[a].name, &images[b].name];
-    let name = format!("{} {}", name[0].min(name[1]), name[0].max(name[1]));
+    let matches = add_matches(graph, images, features, (a, b), config);
+    let name = pair_name(images, a, b);
     let (a, b) = if is_swapped(images, a, b) { (b, a) } else { (a, b) };
-    let matching = config.matching.clone();
     let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
-    let match_work = move |inputs: &Inputs<'_, '_>| {
-        let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
-        Product::new(PairMatches(stages::match_features(&matching, posture, &first, &second)))
-    };
-    let matches = graph.add(Job {
-        kind: "matches",
-        version: stages::MATCHING_VERSION,
-        name: name.clone(),
-        params: json!({ "matching": config.matching, "posture": posture }),
-        external: BTreeMap::new(),
-        memory: 8 << 20,
-        work: Box::new(match_work),
-    });
     let seed = derived_seed(seed, &[&images[a].hash.to_string(), &images[b].hash.to_string()]);
     let (two_view, cameras) = (config.two_view.clone(), [images[a].camera.clone(), images[b].camera.clone()]);
     let params = json!({ "two_view": two_view, "cameras": cameras, "seed": seed });
@@ -248,12 +236,106 @@ fn add_pair(
         memory: 8 << 20,
         work: Box::new(verify_work),
     });
-    for job in [matches, verified] {
-        graph.require(job, "first", features[a]);
-        graph.require(job, "second", features[b]);
-    }
-    graph.require(verified, "matches", matches);
+    require_pair(graph, verified, features, (a, b), matches);
     PairJobs { matches, verified }
+}
+
+/// A job of a pair uses its matches and both images' features, in the order of its matches.
+fn require_pair(
+    graph: &mut JobGraph<'_>,
+    job: JobId,
+    features: &[JobId],
+    (a, b): (usize, usize),
+    matches: JobId,
+) {
+    graph.require(job, "first", features[a]);
+    graph.require(job, "second", features[b]);
+    graph.require(job, "matches", matches);
+}
+
+fn pair_name(images: &[SourceImage], a: usize, b: usize) -> String {
+    let name = [&images[a].name, &images[b].name];
+    format!("{} {}", name[0].min(name[1]), name[0].max(name[1]))
+}
+
+/// Adds matching of one pair.
+fn add_matches(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    features: &[JobId],
+    (a, b): (usize, usize),
+    config: &Config,
+) -> JobId {
+    let name = pair_name(images, a, b);
+    let (a, b) = if is_swapped(images, a, b) { (b, a) } else { (a, b) };
+    let matching = config.matching.clone();
+    let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
+    let match_work = move |inputs: &Inputs<'_, '_>| {
+        let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
+        Product::new(PairMatches(stages::match_features(&matching, posture, &first, &second)))
+    };
+    let matches = graph.add(Job {
+        kind: "matches",
+        version: stages::MATCHING_VERSION,
+        name,
+        params: json!({ "matching": config.matching, "posture": posture }),
+        external: BTreeMap::new(),
+        memory: 8 << 20,
+        work: Box::new(match_work),
+    });
+    graph.require(matches, "first", features[a]);
+    graph.require(matches, "second", features[b]);
+    matches
+}
+
+/// Pixels of a pair that are compared to tell a focal length by a turn, as shares of the longer side: deviation, and the range of
+/// focal lengths.
+const TURN_NOISE: f64 = 0.001;
+const TURN_FOCAL: (f64, f64) = (0.3, 5.0);
+/// Fewest matches that tell a focal length by a turn.
+const MIN_TURNED: usize = 30;
+
+/// Adds the jobs that tell the focal length of the camera of two images by its turn on the spot.
+pub fn add_turned(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    features: &[JobId],
+    (a, b): (usize, usize),
+    config: &Config,
+    seed: u64,
+) -> JobId {
+    let matches = add_matches(graph, images, features, (a, b), config);
+    let name = pair_name(images, a, b);
+    let (a, b) = if is_swapped(images, a, b) { (b, a) } else { (a, b) };
+    let seed = derived_seed(seed, &[&images[a].hash.to_string(), &images[b].hash.to_string()]);
+    let [width, height] = [images[a].camera.width, images[a].camera.height].map(f64::from);
+    let params = json!({ "size": [width, height], "seed": seed });
+    let work = move |inputs: &Inputs<'_, '_>| {
+        let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
+        let matches = inputs.get::<PairMatches>("matches")?;
+        let middle = Vector2::new(width, height) / 2.0;
+        let pixel = |of: &ImageFeatures, at: u32| Some(of.keypoints.get(at as usize)?.pixel() - middle);
+        let pixels =
+            matches.0.iter().filter_map(|m| Some((pixel(&first, m.first)?, pixel(&second, m.second)?)));
+        let (first, second): (Vec<_>, Vec<_>) = pixels.unzip();
+        let params =
+            RansacParams { max_iterations: 1000, min_inliers: MIN_TURNED, ..RansacParams::default() };
+        let side = width.max(height);
+        let range = (TURN_FOCAL.0 * side, TURN_FOCAL.1 * side);
+        let turned = estimate_turned_camera(&params, &first, &second, TURN_NOISE * side, range, seed);
+        Product::new(TurnedPair(turned))
+    };
+    let turned = graph.add(Job {
+        kind: "turned",
+        version: stages::TURNED_VERSION,
+        name,
+        params,
+        external: BTreeMap::new(),
+        memory: 8 << 20,
+        work: Box::new(work),
+    });
+    require_pair(graph, turned, features, (a, b), matches);
+    turned
 }
 
 /// Cameras shared by the images that have the same one.

@@ -8,9 +8,10 @@ use crate::graph::{Event, Observer};
 use crate::print;
 
 /// Stages in the order they are shown.
-const STAGES: [&str; 10] = [
+const STAGES: [&str; 11] = [
     "features",
     "matches",
+    "turned",
     "verify",
     "model",
     "aligned",

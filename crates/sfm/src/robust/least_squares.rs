@@ -22,7 +22,7 @@ pub(crate) struct Normal<const D: usize> {
 }
 
 impl<const D: usize> Normal<D> {
-    fn zeros() -> Self {
+    pub(crate) fn zeros() -> Self {
         Self { matrix: SMatrix::zeros(), gradient: SVector::zeros() }
     }
 
