@@ -91,7 +91,8 @@ pub fn best_answers<'a>(
 /// Locates photos; `target` is the photo that decides in [`Mode::Auto`].
 ///
 /// Where intrinsics of a set are a guess, the set is located twice: the second time with the cameras that the scene told the
-/// first time, which `folder` has afterwards. Before that, guesses that do not hold are improved by a model of the photos.
+/// first time, which `folder` has afterwards. Before that, photos taken on one spot tell theirs, and guesses that do not hold are
+/// improved by a model of the photos.
 /// Photos alone keep the guess in [`Mode::Both`], which compares methods.
 ///
 /// # Errors
@@ -117,8 +118,13 @@ pub fn locate(
         let photos = what.config.photo_features();
         let (alike, before) = alike_pairs(session, name, &folder.images, &photos, &what.config)?;
         whole.absorb(before);
-        let params = (&photos, &what.config);
-        whole.absorb(guess_by_turns(session, name, &mut folder.images, &alike, params, what.seed)?);
+        let (mut guessed, params) = (folder.images.clone(), (&photos, &what.config));
+        whole.absorb(guess_by_turns(session, name, &mut guessed, &alike, params, what.seed)?);
+        let is_told = guessed.iter().zip(&folder.images).any(|(told, given)| told.camera != given.camera);
+        if is_told && mode == Mode::Both {
+            whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);
+        }
+        folder.images = guessed;
         let lone: Vec<bool> =
             folder.images.iter().map(|image| is_lone_guess(&folder.images, image)).collect();
         if lone.contains(&true) {
