@@ -8,7 +8,7 @@ use setloc_camset::{AnywhereLocalization, PhotoLocalization, SetLocalization, Ve
 use setloc_features::{Calibration, Camera};
 use setloc_sfm::MapperOutput;
 
-use crate::building::{alike_pairs, estimate_cameras};
+use crate::building::{alike_pairs, estimate_cameras, has_guessed_cameras};
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::fingerprint::ContentHash;
@@ -115,16 +115,18 @@ pub fn locate(
         located.single.iter().any(|photo| photo.name == target && photo.verdict == Verdict::Localized);
     let wanted = matches!(mode, Mode::Set | Mode::Both) || (mode == Mode::Auto && !found);
     if wanted {
-        let photos = what.config.photo_features();
-        let (alike, before) = alike_pairs(session, name, &folder.images, &photos, &what.config)?;
-        whole.absorb(before);
-        let (mut guessed, params) = (folder.images.clone(), (&photos, &what.config));
-        whole.absorb(guess_by_turns(session, name, &mut guessed, &alike, params, what.seed)?);
-        let is_told = guessed.iter().zip(&folder.images).any(|(told, given)| told.camera != given.camera);
-        if is_told && mode == Mode::Both {
-            whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);
+        if has_guessed_cameras(&folder.images) {
+            let photos = what.config.photo_features();
+            let (alike, before) = alike_pairs(session, name, &folder.images, &photos, &what.config)?;
+            whole.absorb(before);
+            let (mut guessed, params) = (folder.images.clone(), (&photos, &what.config));
+            whole.absorb(guess_by_turns(session, name, &mut guessed, &alike, params, what.seed)?);
+            let is_told = guessed.iter().zip(&folder.images).any(|(told, given)| told.camera != given.camera);
+            if is_told && mode == Mode::Both {
+                whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);
+            }
+            folder.images = guessed;
         }
-        folder.images = guessed;
         let lone: Vec<bool> =
             folder.images.iter().map(|image| is_lone_guess(&folder.images, image)).collect();
         if lone.contains(&true) {

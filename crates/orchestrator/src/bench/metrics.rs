@@ -102,7 +102,7 @@ fn flatten(figures: &DatasetFigures) -> Vec<(String, f64)> {
     // Units of a joint reconstruction say nothing by themselves.
     let (units, suffix) = match &figures.joint_reference {
         None => (1.0, "m"),
-        Some(joint) => (100.0 / joint.extent, "percent_of_extent"),
+        Some(joint) => (joint.percent(), "percent_of_extent"),
     };
     for set in &figures.sets {
         for (method, of_method) in &set.methods {

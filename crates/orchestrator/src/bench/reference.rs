@@ -43,7 +43,7 @@ impl JointReference {
     pub(super) fn build(
         session: &Session,
         scene: &ImageFolder,
-        sets: &[ImageFolder],
+        sets: &[&ImageFolder],
         options: &BenchOptions,
         name: &str,
     ) -> Result<Self> {
@@ -59,7 +59,7 @@ impl JointReference {
         let names = |folder: &ImageFolder| -> Vec<String> {
             folder.images.iter().map(|image| image.name.clone()).collect()
         };
-        let photos: Vec<String> = sets.iter().flat_map(names).collect();
+        let photos: Vec<String> = sets.iter().copied().flat_map(names).collect();
         Ok(Self::of(poses, &names(scene), &photos))
     }
 
@@ -80,6 +80,11 @@ impl JointReference {
         } else {
             reference
         }
+    }
+
+    /// Percent of the extent in one of its units.
+    pub fn percent(&self) -> f64 {
+        100.0 / self.extent
     }
 
     /// Whether there is anything to compare with.

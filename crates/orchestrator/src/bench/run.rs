@@ -15,7 +15,7 @@ use super::{
 use crate::building::{BuildOutcome, Built, SceneSource, build_scene};
 use crate::config::Config;
 use crate::dataset::{CameraBook, GeoSource, ImageFolder, SkippedImage, Truth, list_images};
-use crate::error::Hinted;
+use crate::error::{Hinted, Interrupted, concerns_the_disk};
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, Mode, locate};
 use crate::pictures::PictureBook;
@@ -224,9 +224,17 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     let (stages, peak_rss_mb) = (session.report.stages(), crate::clock::peak_rss_mib());
     let is_told = truth.as_ref().is_some_and(|truth| truth.names("queries/").next().is_some());
     let joint_reference = if options.joint_reference && !is_told && !found.is_empty() {
-        let photos: Vec<ImageFolder> = found.iter().map(|set| set.photos.clone()).collect();
+        let photos: Vec<&ImageFolder> = found.iter().map(|set| &set.photos).collect();
         let name = run_name(&root.join("joint"));
-        Some(JointReference::build(session, &folder, &photos, options, &name)?)
+        match JointReference::build(session, &folder, &photos, options, &name) {
+            Ok(reference) => Some(reference),
+            Err(error) if error.is::<Interrupted>() || concerns_the_disk(&error) => return Err(error),
+            // What was located is told all the same.
+            Err(error) => {
+                warnings.push(format!("there is no joint reconstruction to compare with: {error:#}"));
+                None
+            }
+        }
     } else {
         None
     };

@@ -36,7 +36,7 @@ pub fn markdown_tables(figures: &DatasetFigures) -> String {
             Some(joint) => joint_heading(&mut text, joint),
         }
         text += "| set | method | #reg./#total | min | median | max | mean | target |\n|---|---|---|---|---|---|---|---|\n";
-        let units = figures.joint_reference.as_ref().map_or(1.0, |joint| 100.0 / joint.extent);
+        let units = figures.joint_reference.as_ref().map_or(1.0, JointReference::percent);
         for set in &figures.sets {
             for method in METHODS {
                 if let Some(figures) = set.methods.get(method) {

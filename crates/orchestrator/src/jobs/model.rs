@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use nalgebra::Vector2;
-use serde_json::json;
+use serde_json::{Value, json};
 use setloc_features::{Calibration, Camera, ImageFeatures, Match};
 use setloc_sfm::robust::{RansacParams, estimate_turned_camera};
 use setloc_sfm::{
@@ -213,13 +213,12 @@ fn add_pair(
     seed: u64,
 ) -> PairJobs {
     let matches = add_matches(graph, images, features, (a, b), config);
-    let name = pair_name(images, a, b);
-    let (a, b) = if is_swapped(images, a, b) { (b, a) } else { (a, b) };
+    let (a, b) = in_order(images, (a, b));
     let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
-    let seed = derived_seed(seed, &[&images[a].hash.to_string(), &images[b].hash.to_string()]);
+    let seed = pair_seed(images, (a, b), seed);
     let (two_view, cameras) = (config.two_view.clone(), [images[a].camera.clone(), images[b].camera.clone()]);
     let params = json!({ "two_view": two_view, "cameras": cameras, "seed": seed });
-    let verify_work = move |inputs: &Inputs<'_, '_>| {
+    let work = move |inputs: &Inputs<'_, '_>| {
         let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
         let matches = inputs.get::<PairMatches>("matches")?;
         // Far fewer are matched than found, and a ray takes longer than what verification does with it.
@@ -227,35 +226,45 @@ fn add_pair(
         let second = second.rays_of(&cameras[1], matches.0.iter().map(|m| m.second));
         Product::new(VerifiedPair(verify_pair(&two_view, posture, &first, &second, &matches.0, seed)))
     };
-    let verified = graph.add(Job {
-        kind: "verify",
-        version: stages::VERIFY_VERSION,
-        name,
-        params,
-        external: BTreeMap::new(),
-        memory: 8 << 20,
-        work: Box::new(verify_work),
-    });
-    require_pair(graph, verified, features, (a, b), matches);
+    let job = pair_job(images, (a, b), ("verify", stages::VERIFY_VERSION), params, work);
+    let verified = add_pair_job(graph, job, features, (a, b));
+    graph.require(verified, "matches", matches);
     PairJobs { matches, verified }
 }
 
-/// A job of a pair uses its matches and both images' features, in the order of its matches.
-fn require_pair(
-    graph: &mut JobGraph<'_>,
-    job: JobId,
-    features: &[JobId],
-    (a, b): (usize, usize),
-    matches: JobId,
-) {
-    graph.require(job, "first", features[a]);
-    graph.require(job, "second", features[b]);
-    graph.require(job, "matches", matches);
+/// Two images in the order of their jobs' matches.
+fn in_order(images: &[SourceImage], (a, b): (usize, usize)) -> (usize, usize) {
+    if is_swapped(images, a, b) { (b, a) } else { (a, b) }
 }
 
-fn pair_name(images: &[SourceImage], a: usize, b: usize) -> String {
+fn pair_seed(images: &[SourceImage], (a, b): (usize, usize), seed: u64) -> u64 {
+    derived_seed(seed, &[&images[a].hash.to_string(), &images[b].hash.to_string()])
+}
+
+/// A job about two images.
+fn pair_job<'a>(
+    images: &[SourceImage],
+    (a, b): (usize, usize),
+    (kind, version): (&'static str, u32),
+    params: Value,
+    work: impl Fn(&Inputs<'_, '_>) -> Result<Product> + Send + Sync + 'a,
+) -> Job<'a> {
     let name = [&images[a].name, &images[b].name];
-    format!("{} {}", name[0].min(name[1]), name[0].max(name[1]))
+    let name = format!("{} {}", name[0].min(name[1]), name[0].max(name[1]));
+    Job { kind, version, name, params, external: BTreeMap::new(), memory: 8 << 20, work: Box::new(work) }
+}
+
+/// Adds a job that uses the features of two images.
+fn add_pair_job<'a>(
+    graph: &mut JobGraph<'a>,
+    job: Job<'a>,
+    features: &[JobId],
+    (a, b): (usize, usize),
+) -> JobId {
+    let job = graph.add(job);
+    graph.require(job, "first", features[a]);
+    graph.require(job, "second", features[b]);
+    job
 }
 
 /// Adds matching of one pair.
@@ -263,29 +272,19 @@ fn add_matches(
     graph: &mut JobGraph<'_>,
     images: &[SourceImage],
     features: &[JobId],
-    (a, b): (usize, usize),
+    pair: (usize, usize),
     config: &Config,
 ) -> JobId {
-    let name = pair_name(images, a, b);
-    let (a, b) = if is_swapped(images, a, b) { (b, a) } else { (a, b) };
+    let (a, b) = in_order(images, pair);
     let matching = config.matching.clone();
     let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
-    let match_work = move |inputs: &Inputs<'_, '_>| {
+    let params = json!({ "matching": config.matching, "posture": posture });
+    let work = move |inputs: &Inputs<'_, '_>| {
         let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
         Product::new(PairMatches(stages::match_features(&matching, posture, &first, &second)))
     };
-    let matches = graph.add(Job {
-        kind: "matches",
-        version: stages::MATCHING_VERSION,
-        name,
-        params: json!({ "matching": config.matching, "posture": posture }),
-        external: BTreeMap::new(),
-        memory: 8 << 20,
-        work: Box::new(match_work),
-    });
-    graph.require(matches, "first", features[a]);
-    graph.require(matches, "second", features[b]);
-    matches
+    let job = pair_job(images, (a, b), ("matches", stages::MATCHING_VERSION), params, work);
+    add_pair_job(graph, job, features, (a, b))
 }
 
 /// Pixels of a pair that are compared to tell a focal length by a turn, as shares of the longer side: deviation, and the range of
@@ -305,9 +304,8 @@ pub fn add_turned(
     seed: u64,
 ) -> JobId {
     let matches = add_matches(graph, images, features, (a, b), config);
-    let name = pair_name(images, a, b);
-    let (a, b) = if is_swapped(images, a, b) { (b, a) } else { (a, b) };
-    let seed = derived_seed(seed, &[&images[a].hash.to_string(), &images[b].hash.to_string()]);
+    let (a, b) = in_order(images, (a, b));
+    let seed = pair_seed(images, (a, b), seed);
     let [width, height] = [images[a].camera.width, images[a].camera.height].map(f64::from);
     let params = json!({ "size": [width, height], "seed": seed });
     let work = move |inputs: &Inputs<'_, '_>| {
@@ -325,16 +323,9 @@ pub fn add_turned(
         let turned = estimate_turned_camera(&params, &first, &second, TURN_NOISE * side, range, seed);
         Product::new(TurnedPair(turned))
     };
-    let turned = graph.add(Job {
-        kind: "turned",
-        version: stages::TURNED_VERSION,
-        name,
-        params,
-        external: BTreeMap::new(),
-        memory: 8 << 20,
-        work: Box::new(work),
-    });
-    require_pair(graph, turned, features, (a, b), matches);
+    let job = pair_job(images, (a, b), ("turned", stages::TURNED_VERSION), params, work);
+    let turned = add_pair_job(graph, job, features, (a, b));
+    graph.require(turned, "matches", matches);
     turned
 }
 
