@@ -97,8 +97,8 @@ pub(crate) fn mean_shift(
 /// Fixed poses of a bundle problem that common errors move.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct CommonErrors {
-    /// Far cameras that hold scene points, which shift with their point.
-    pub far: Vec<(u32, Matrix3x6<f64>)>,
+    /// Cameras that hold scene points, which shift with their point.
+    pub points: Vec<(u32, Matrix3x6<f64>)>,
     /// Images of the scene.
     pub views: Vec<(u32, PoseError)>,
 }
@@ -111,7 +111,7 @@ impl CommonErrors {
         problem: &BundleProblem,
         poses: usize,
     ) -> Option<Vec<Matrix6<f64>>> {
-        if self.far.is_empty() && self.views.is_empty() {
+        if self.points.is_empty() && self.views.is_empty() {
             return None;
         }
         let solved = |(error, sign): (usize, f64)| {
@@ -135,7 +135,7 @@ impl CommonErrors {
     }
 
     fn apply(&self, problem: &mut BundleProblem, error: usize, sign: f64) {
-        for (pose, shift) in &self.far {
+        for (pose, shift) in &self.points {
             problem.poses[*pose as usize].world_from_camera.translation += shift.column(error) * sign;
         }
         for (pose, view) in &self.views {

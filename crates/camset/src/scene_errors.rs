@@ -20,8 +20,8 @@ const LEAST_INFORMATION: f64 = 1e-4;
 /// What of a bundle problem hangs on images of the scene.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct HeldByScene {
-    /// Far cameras that hold each scene point, which shift with it.
-    pub far: BTreeMap<PointId, Vec<u32>>,
+    /// Cameras that hold each scene point, which shift with it.
+    pub points: BTreeMap<PointId, Vec<u32>>,
     /// Poses that are images of the scene.
     pub views: BTreeMap<u32, ImageId>,
 }
@@ -36,7 +36,7 @@ impl HeldByScene {
         poses: usize,
     ) -> Option<Vec<Matrix6<f64>>> {
         let errors = scene.errors.filter(|errors| errors.draws() > 0)?;
-        if self.far.is_empty() && self.views.is_empty() {
+        if self.points.is_empty() && self.views.is_empty() {
             return None;
         }
         let images = self.images(scene);
@@ -58,13 +58,13 @@ impl HeldByScene {
 
     /// The images that see any of it.
     fn images(&self, scene: &Scene<'_>) -> BTreeSet<ImageId> {
-        let points = self.far.keys().filter_map(|point| scene.reconstruction.points.get(point.index()));
+        let points = self.points.keys().filter_map(|point| scene.reconstruction.points.get(point.index()));
         let see = points.flat_map(|point| point.track.iter().map(|seen| seen.image));
         see.chain(self.views.values().copied()).collect()
     }
 
     fn apply(&self, draw: &Draw<'_>, problem: &mut BundleProblem) {
-        for (&point, poses) in &self.far {
+        for (&point, poses) in &self.points {
             let shift = draw.shift_of(point).unwrap_or_default();
             for &pose in poses {
                 problem.poses[pose as usize].world_from_camera.translation += shift;

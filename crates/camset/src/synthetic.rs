@@ -12,6 +12,7 @@ use setloc_features::{
     Calibration, Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint, MatchParams,
 };
 use setloc_index::{IndexParams, SceneIndex};
+use setloc_sfm::solvers::triangulation::{WorldRay, triangulate};
 use setloc_sfm::synthetic::normal;
 use setloc_sfm::{
     AlignedTrack, BaselineLength, CameraId, ImageId, Observation, PointId, Reconstruction,
@@ -153,6 +154,22 @@ fn model_of(place: &Place, views: &[View], camera: &Camera) -> (Reconstruction, 
     (model, shown)
 }
 
+/// Puts the points of a model where the rays to their keypoints meet.
+fn place_points(model: &mut Reconstruction, features: &[&ImageFeatures]) {
+    let Reconstruction { cameras, images, points, .. } = model;
+    for point in points {
+        let ray = |seen: &Observation| {
+            let (image, keypoint) =
+                (&images[seen.image.index()], &features[seen.image.index()].keypoints[seen.feature as usize]);
+            let (bearing, angle) = cameras[image.camera.index()].ray(&keypoint.pixel()).unwrap();
+            let sigma = angle * f64::from(keypoint.noise_px);
+            WorldRay::new(&image.world_from_camera.unwrap(), &bearing, sigma)
+        };
+        let rays: Vec<WorldRay> = point.track.iter().map(ray).collect();
+        point.position = triangulate(&rays).unwrap_or(point.position);
+    }
+}
+
 /// Panoramas, their model and index; a chain of photos and their local model.
 pub struct World {
     /// Positions of the place's points.
@@ -214,13 +231,8 @@ impl World {
             .collect();
         let (mut scene_model, scene_points) = model_of(place, &panoramas, &panorama);
         let features: Vec<&ImageFeatures> = panoramas.iter().map(|view| &view.features).collect();
-        let index = SceneIndex::build(&IndexParams::default(), &scene_model, &features);
         // Scene points are as wrong as the panoramas' pixel noise leaves them.
-        let mut rng = ChaCha8Rng::seed_from_u64(seed * 1000 + 99);
-        for (i, point) in scene_model.points.iter_mut().enumerate() {
-            let factor = index.position_covariance(PointId(i as u32)).cholesky().unwrap().l();
-            point.position += factor * Vector3::from_fn(|_, _| normal(&mut rng));
-        }
+        place_points(&mut scene_model, &features);
         let index = SceneIndex::build(&IndexParams::default(), &scene_model, &features);
         let camera = pinhole();
         let photos: Vec<View> = poses
