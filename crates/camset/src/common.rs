@@ -9,7 +9,7 @@
 //! How the errors of two photos go together is not known. Neighbours of one set err alike, and errors that go together
 //! are the worst for what hangs on several photos; so all are taken to.
 
-use nalgebra::{Matrix3x6, Matrix6, Vector3};
+use nalgebra::{Matrix3, Matrix3x6, Matrix6, SMatrix, Vector3};
 use rayon::prelude::*;
 use setloc_sfm::bundle::{self, BundleParams, BundleProblem};
 use setloc_sfm::{ImageId, PointId, Rigid};
@@ -78,20 +78,53 @@ pub(crate) fn shift_of_point(scene: &Scene<'_>, point: PointId) -> Option<Matrix
         return None;
     }
     let errors = found.track.iter().filter_map(|seen| PoseError::of_image(scene, seen.image));
-    mean_shift(&found.position, errors)
+    shift_by(&found.position, errors)
 }
 
-/// Mean shift of a point that is carried by several photos, whose errors go together.
-pub(crate) fn mean_shift(
+/// Least information of a point along an axis, as a share of that along its best.
+const LEAST_INFORMATION: f64 = 1e-4;
+
+/// How far a point shifts by errors of what sees it: to where the moved rays meet. All rays count as equally exact.
+#[derive(Debug, Clone)]
+pub(crate) struct Meeting<const N: usize> {
+    information: Matrix3<f64>,
+    pull: SMatrix<f64, 3, N>,
+}
+
+impl<const N: usize> Meeting<N> {
+    pub(crate) fn new() -> Self {
+        Self { information: Matrix3::zeros(), pull: SMatrix::zeros() }
+    }
+
+    /// Adds a ray from `origin`, which errors carry by `carried` (one column each) where it passes the point.
+    pub(crate) fn add(&mut self, point: &Vector3<f64>, origin: &Vector3<f64>, carried: &SMatrix<f64, 3, N>) {
+        let offset = point - origin;
+        let Some(direction) = offset.try_normalize(f64::EPSILON) else { return };
+        let across = (Matrix3::identity() - direction * direction.transpose()) / offset.norm_squared();
+        self.information += across;
+        self.pull += across * carried;
+    }
+
+    /// The shift; `None` without rays.
+    pub(crate) fn shift(self) -> Option<SMatrix<f64, 3, N>> {
+        let eigen = self.information.symmetric_eigen();
+        let least = LEAST_INFORMATION * eigen.eigenvalues.max();
+        let inverse = eigen.eigenvalues.map(|along| 1.0 / along.max(least));
+        let axes = eigen.eigenvectors;
+        (least > 0.0).then(|| axes * Matrix3::from_diagonal(&inverse) * axes.transpose() * self.pull)
+    }
+}
+
+/// Shift of a point by the errors of the photos that see it, which go together.
+pub(crate) fn shift_by(
     point: &Vector3<f64>,
     errors: impl Iterator<Item = PoseError>,
 ) -> Option<Matrix3x6<f64>> {
-    let (mut sum, mut count) = (Matrix3x6::zeros(), 0_usize);
+    let mut meeting = Meeting::new();
     for error in errors {
-        sum += error.carries(point);
-        count += 1;
+        meeting.add(point, &error.center, &error.carries(point));
     }
-    (count > 0).then(|| sum / count as f64)
+    meeting.shift()
 }
 
 /// Fixed poses of a bundle problem that common errors move.

@@ -6,16 +6,14 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{Matrix3, Matrix6, Vector3};
+use nalgebra::{Matrix6, Vector3};
 use rayon::prelude::*;
 use setloc_sfm::bundle::{self, BundleParams, BundleProblem};
 use setloc_sfm::{BearingField, ImageId, ModelErrors, PointId};
 
 use crate::Scene;
+use crate::common::Meeting;
 use crate::jackknife::deviation;
-
-/// Least information of a point along an axis, as a share of that along its best.
-const LEAST_INFORMATION: f64 = 1e-4;
 
 /// What of a bundle problem hangs on images of the scene.
 #[derive(Debug, Clone, Default)]
@@ -101,25 +99,18 @@ impl<'a> Draw<'a> {
     fn shift_of(&self, point: PointId) -> Option<Vector3<f64>> {
         let scene = self.scene.reconstruction;
         let found = scene.points.get(point.index())?;
-        let (mut information, mut pull) = (Matrix3::zeros(), Vector3::zeros());
+        let mut meeting = Meeting::new();
         for seen in &found.track {
             let Some(pose) = scene.images.get(seen.image.index())?.world_from_camera else { continue };
             let Some(field) = self.fields.get(&seen.image) else { continue };
             let offset = found.position - pose.translation;
-            let distance = offset.norm();
             let Some(direction) = offset.try_normalize(f64::EPSILON) else { continue };
-            let across = (Matrix3::identity() - direction * direction.transpose()) / distance.powi(2);
             let bearing = pose.rotation.inverse() * direction;
             let moved = self.errors.pose(seen.image, self.number).unwrap_or(pose);
-            let there = moved.translation + moved.rotation * (bearing + field.at(&bearing)) * distance;
-            information += across;
-            pull += across * (there - found.position);
+            let there = moved.translation + moved.rotation * (bearing + field.at(&bearing)) * offset.norm();
+            meeting.add(&found.position, &pose.translation, &(there - found.position));
         }
-        let eigen = information.symmetric_eigen();
-        let least = LEAST_INFORMATION * eigen.eigenvalues.max();
-        let inverse = eigen.eigenvalues.map(|along| 1.0 / along.max(least));
-        let axes = eigen.eigenvectors;
-        (least > 0.0).then(|| axes * Matrix3::from_diagonal(&inverse) * axes.transpose() * pull)
+        meeting.shift()
     }
 }
 

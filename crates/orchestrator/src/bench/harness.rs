@@ -36,13 +36,14 @@ pub struct HarnessRun {
 }
 
 /// What is said of a data set's truth and licence.
-pub fn about(truth: TruthKind, licence: &str) -> String {
+pub fn about(truth: TruthKind, joint_reference: bool, licence: &str) -> String {
     let truth = match truth {
         TruthKind::Exact => "Truth: exact (rendered).",
         TruthKind::Measured => "Truth: measured.",
-        TruthKind::None => {
+        TruthKind::None if joint_reference => {
             "No truth: photos are compared with a reconstruction of scene and photos together."
         }
+        TruthKind::None => "No truth.",
     };
     format!("{truth} Licence: {licence}.")
 }

@@ -121,7 +121,7 @@ fn run_entry(
     let output = args.output.join(&entry.name).join(&set.name);
     let figures = repeat(args, &run, root, entry.gps, &output)?;
     let metrics = metrics_of(&figures);
-    let about = about(entry.truth, &entry.licence);
+    let about = about(entry.truth, !args.no_joint_reference, &entry.licence);
     Ok(HarnessRun { name, about, settings: set.settings.clone(), figures, metrics })
 }
 

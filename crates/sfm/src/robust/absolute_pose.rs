@@ -3,7 +3,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
-use super::ransac::{Consensus, RansacParams, distinct, lo_ransac};
+use super::ransac::{Consensus, RansacParams, distinct, lo_ransac, robust_cost};
 use super::residual::AngularResidual;
 use crate::Rigid;
 use crate::solvers::p3p;
@@ -233,12 +233,7 @@ impl LeastSquares<6> for AbsoluteFit<'_> {
     }
 
     fn cost(&self, model: &CameraFromWorld) -> f64 {
-        let mut cost = 0.0;
-        for index in self.inliers {
-            let squared = self.data.squared_residual(model, *index as usize, f64::INFINITY);
-            cost += cauchy(squared, self.data.inverse_scale_squared).0;
-        }
-        cost
+        robust_cost(self.data, model, self.inliers, self.data.inverse_scale_squared)
     }
 
     fn step(&self, model: &CameraFromWorld, delta: &SVector<f64, 6>) -> CameraFromWorld {

@@ -3,7 +3,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::absolute_pose::{cauchy_scale, turned};
 use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
-use super::ransac::{Consensus, RansacParams, distinct, lo_ransac};
+use super::ransac::{Consensus, RansacParams, distinct, lo_ransac, robust_cost};
 use crate::Rigid;
 use crate::solvers::p4pf;
 
@@ -151,12 +151,7 @@ impl LeastSquares<7> for FocalFit<'_> {
     }
 
     fn cost(&self, model: &Pinhole) -> f64 {
-        let mut cost = 0.0;
-        for index in self.inliers {
-            let squared = self.data.squared_residual(model, *index as usize, f64::INFINITY);
-            cost += cauchy(squared, self.data.inverse_scale_squared).0;
-        }
-        cost
+        robust_cost(self.data, model, self.inliers, self.data.inverse_scale_squared)
     }
 
     fn step(&self, model: &Pinhole, delta: &SVector<f64, 7>) -> Pinhole {

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::GeneralizedRay;
 use super::absolute_pose::{cauchy_scale, turned};
 use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
-use super::ransac::{Consensus, RansacParams, distinct, lo_ransac};
+use super::ransac::{Consensus, RansacParams, distinct, lo_ransac, robust_cost};
 use super::residual::AngularResidual;
 use crate::solvers::{dlt, gp3p, gp4ps, p3p, ugp3ps};
 use crate::{Rigid, Similarity};
@@ -367,12 +367,7 @@ impl LeastSquares<7> for GeneralizedFit<'_> {
     }
 
     fn cost(&self, model: &SetFromWorld) -> f64 {
-        let mut cost = 0.0;
-        for index in self.inliers {
-            let squared = self.data.squared_residual(model, *index as usize, f64::INFINITY);
-            cost += cauchy(squared, self.data.inverse_scale_squared).0;
-        }
-        cost
+        robust_cost(self.data, model, self.inliers, self.data.inverse_scale_squared)
     }
 
     fn step(&self, model: &SetFromWorld, delta: &SVector<f64, 7>) -> SetFromWorld {

@@ -2,6 +2,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
+use super::least_squares::cauchy;
+
 /// How to sample, score and stop.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -87,6 +89,17 @@ pub(super) trait Consensus {
 
     /// Nonlinear refinement on the given data.
     fn refine(&self, model: &Self::Model, inliers: &[u32], max_steps: usize) -> Self::Model;
+}
+
+/// Cost of some data under Cauchy's loss, as [`least_squares`](super::least_squares) wants it.
+pub(super) fn robust_cost<C: Consensus>(
+    problem: &C,
+    model: &C::Model,
+    inliers: &[u32],
+    inverse_scale_squared: f64,
+) -> f64 {
+    let squared = |index: u32| problem.squared_residual(model, index as usize, f64::INFINITY);
+    inliers.iter().map(|&index| cauchy(squared(index), inverse_scale_squared).0).sum()
 }
 
 /// What came out.

@@ -3,7 +3,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::absolute_pose::cauchy_scale;
 use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
-use super::ransac::{Consensus, RansacParams, distinct, lo_ransac};
+use super::ransac::{Consensus, RansacParams, distinct, lo_ransac, robust_cost};
 use super::residual::AngularResidual;
 use crate::solvers::ray_homography;
 
@@ -110,8 +110,7 @@ impl LeastSquares<9> for HomographyFit<'_> {
     }
 
     fn cost(&self, model: &Matrix3<f64>) -> f64 {
-        let squared = |index: &u32| self.data.squared_residual(model, *index as usize, f64::INFINITY);
-        self.inliers.iter().map(|index| cauchy(squared(index), self.data.inverse_scale_squared).0).sum()
+        robust_cost(self.data, model, self.inliers, self.data.inverse_scale_squared)
     }
 
     fn step(&self, model: &Matrix3<f64>, delta: &SVector<f64, 9>) -> Matrix3<f64> {

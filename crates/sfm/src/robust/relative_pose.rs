@@ -3,7 +3,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::absolute_pose::{cauchy_scale, turned};
 use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
-use super::ransac::{Consensus, Consented, RansacParams, distinct, lo_ransac, lo_ransac_from};
+use super::ransac::{Consensus, Consented, RansacParams, distinct, lo_ransac, lo_ransac_from, robust_cost};
 use super::residual::AngularResidual;
 use crate::Rigid;
 use crate::solvers::essential::{is_in_front, rotations_of_essential};
@@ -467,8 +467,7 @@ impl LeastSquares<3> for RotationFit<'_> {
     }
 
     fn cost(&self, model: &Matrix3<f64>) -> f64 {
-        let squared = |index: &u32| self.data.squared_residual(model, *index as usize, f64::INFINITY);
-        self.inliers.iter().map(|index| cauchy(squared(index), self.data.0.inverse_scale_squared).0).sum()
+        robust_cost(self.data, model, self.inliers, self.data.0.inverse_scale_squared)
     }
 
     fn step(&self, model: &Matrix3<f64>, delta: &SVector<f64, 3>) -> Matrix3<f64> {

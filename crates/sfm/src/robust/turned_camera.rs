@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::absolute_pose::{cauchy_scale, turned};
 use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
-use super::ransac::{Consensus, RansacParams, distinct, lo_ransac};
+use super::ransac::{Consensus, RansacParams, distinct, lo_ransac, robust_cost};
 use crate::solvers::turn_with_focal;
 
 /// The focal length that two images of a camera show which was turned on the spot between them.
@@ -179,8 +179,7 @@ impl LeastSquares<4> for TurnFit<'_> {
     }
 
     fn cost(&self, model: &Turn) -> f64 {
-        let squared = |&index: &u32| self.data.squared_residual(model, index as usize, f64::INFINITY);
-        self.inliers.iter().map(|index| cauchy(squared(index), self.data.inverse_scale_squared).0).sum()
+        robust_cost(self.data, model, self.inliers, self.data.inverse_scale_squared)
     }
 
     fn step(&self, model: &Turn, delta: &SVector<f64, 4>) -> Turn {
