@@ -72,7 +72,7 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// set's photos contradict; walls by what is more alike. 36: what matches err alike. 37: wrong matches do not stand for the
 /// noise of right ones. 38: photos that are stretched. 39: pictures of walls by the luma that JPEGs store.
 /// 40: what the scene's poses may be off.
-pub const VERSION: u32 = 43;
+pub const VERSION: u32 = 44;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 pub const GROWTH_VERSION: u32 = 1;

@@ -553,45 +553,46 @@ impl Component<'_> {
         rigid: &RigidPose,
         walls: &[WallSight],
     ) -> Joint {
+        let first = self.rigid_model(set_from_camera, &rigid.world_from_set);
         let refined =
-            |stretch| self.refine_in_rounds((set_from_camera, candidates), sights, rigid, walls, stretch);
-        let joint = refined(PhotoStretch::of_set(self.scene));
-        if joint.model.stretch.is_free { refined(joint.model.stretch) } else { joint }
+            |model, first_round| self.refine_in_rounds(model, first_round, candidates, sights, rigid, walls);
+        let joint = refined(first, 0);
+        // The last round has freed it where matches were already right; freed from the rigid pose on it bends to wrong ones.
+        if joint.model.stretch.is_free { refined(joint.model, self.params.rounds.min(1)) } else { joint }
+    }
+
+    /// The set as it lies in the scene by its rigid pose.
+    fn rigid_model(&self, set_from_camera: &[Rigid], world_from_set: &Similarity) -> JointModel {
+        let photo = |(slot, pose): (usize, &Rigid)| JointPhoto {
+            camera: self.camera_of(slot),
+            world_from_camera: world_from_set.transform_pose(pose),
+            standpoint: standpoint(set_from_camera, slot),
+        };
+        let points = self.model.points.iter();
+        let mut model = JointModel {
+            cameras: self.joint_cameras(),
+            photos: set_from_camera.iter().enumerate().map(photo).collect(),
+            points: points.map(|point| world_from_set.transform_point(&point.position)).collect(),
+            lengths: self.lengths().map(|(slots, length)| (slots, length.held().1)).collect(),
+            stretch: PhotoStretch::of_set(self.scene),
+        };
+        model.give_own_cameras_where_many();
+        model
     }
 
     /// Rounds of the joint refinement: observations are chosen under the present poses, then all poses move.
     fn refine_in_rounds(
         &self,
-        (set_from_camera, candidates): (&[Rigid], &[SetCorrespondence]),
+        mut model: JointModel,
+        first_round: usize,
+        candidates: &[SetCorrespondence],
         sights: &Sights,
         rigid: &RigidPose,
         walls: &[WallSight],
-        stretch: PhotoStretch,
     ) -> Joint {
         let world_from_set = &rigid.world_from_set;
-        let mut model = JointModel {
-            cameras: self.joint_cameras(),
-            photos: set_from_camera
-                .iter()
-                .enumerate()
-                .map(|(slot, pose)| JointPhoto {
-                    camera: self.camera_of(slot),
-                    world_from_camera: world_from_set.transform_pose(pose),
-                    standpoint: standpoint(set_from_camera, slot),
-                })
-                .collect(),
-            points: self
-                .model
-                .points
-                .iter()
-                .map(|point| world_from_set.transform_point(&point.position))
-                .collect(),
-            lengths: self.lengths().map(|(slots, length)| (slots, length.held().1)).collect(),
-            stretch,
-        };
-        model.give_own_cameras_where_many();
         let mut covariances = Vec::new();
-        for round in 0..=self.params.rounds {
+        for round in first_round..=self.params.rounds {
             let cameras: Vec<Camera> =
                 (0..self.members.len()).map(|slot| model.camera_of(slot).clone()).collect();
             let rays = self.rays(|slot| &cameras[slot]);
