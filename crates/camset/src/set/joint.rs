@@ -544,7 +544,7 @@ impl Component<'_> {
         log10_chance_of_more(found, by_chance as f64 + 1.0) <= MAX_LOG10_CHANCE
     }
 
-    /// The paper's T_OPT, from the rigid pose on again where the last round shows that photos are stretched.
+    /// The paper's T_OPT, with further rounds where the last one shows that photos are stretched.
     fn refine_jointly(
         &self,
         set_from_camera: &[Rigid],
@@ -581,6 +581,8 @@ impl Component<'_> {
     }
 
     /// Rounds of the joint refinement: observations are chosen under the present poses, then all poses move.
+    ///
+    /// Round 0 takes the matches that agree with the rigid pose.
     fn refine_in_rounds(
         &self,
         mut model: JointModel,
