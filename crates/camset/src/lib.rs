@@ -71,8 +71,11 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// directions of the scene's images share. 34: and how these change the stretch of panoramas. 35: focal lengths that a
 /// set's photos contradict; walls by what is more alike. 36: what matches err alike. 37: wrong matches do not stand for the
 /// noise of right ones. 38: photos that are stretched. 39: pictures of walls by the luma that JPEGs store.
-/// 40: what the scene's poses may be off.
+/// 40: what the scene's poses may be off. 41: an adjustment's steps are stretched by its curvature. 42: scene points of uncertain
+/// depth are held by parallax. 43: points of a grown scene shift to where moved rays meet. 44: stretched photos go on from where they
+/// are refined to.
 pub const VERSION: u32 = 44;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
-pub const GROWTH_VERSION: u32 = 1;
+/// 2: points shift to where moved rays meet.
+pub const GROWTH_VERSION: u32 = 2;
