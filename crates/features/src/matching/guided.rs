@@ -25,8 +25,8 @@ pub struct GuidedParams {
 impl GuidedParams {
     /// Changes whenever the same parameters and inputs give other matches.
     ///
-    /// 1: band about the great circle, ratio and mutual test. 2: simulated views.
-    pub const VERSION: u32 = 2;
+    /// 1: band about the great circle, ratio and mutual test. 2: simulated views. 3: of these only what is needed.
+    pub const VERSION: u32 = 3;
 }
 
 impl Default for GuidedParams {
@@ -56,7 +56,8 @@ pub fn match_guided(
 
 /// Those matches of [`match_guided`] of which one keypoint at least is needed: far faster where few are.
 ///
-/// `needed` says of every keypoint of the first and of the second image whether it is.
+/// `needed` says of every keypoint of the first and of the second image whether it is. What repeats itself in a simulated view
+/// is told among the matches that are needed.
 pub fn match_guided_among(
     params: &GuidedParams,
     first: (&ImageFeatures, &Rays),
@@ -64,13 +65,7 @@ pub fn match_guided_among(
     second_from_first: &Matrix3<f64>,
     needed: [&[bool]; 2],
 ) -> Vec<Match> {
-    let is_needed = |m: &Match| needed[0][m.first as usize] || needed[1][m.second as usize];
-    // Which of a simulated view's matches repeats another is told by all of them.
-    let has_views = !(first.0.simulated.is_empty() && second.0.simulated.is_empty());
-    let asked = (!has_views).then_some(needed);
-    let mut matches = match_where(params, first, second, second_from_first, asked);
-    matches.retain(is_needed);
-    matches
+    match_where(params, first, second, second_from_first, Some(needed))
 }
 
 /// All matches; where only some keypoints are needed, those of these and any of the others.
@@ -88,12 +83,16 @@ fn match_where(
         // Keypoints alone match nothing.
         return Vec::new();
     }
+    let is_needed = |m: &Match| {
+        needed.is_none_or(|[of_first, of_second]| of_first[m.first as usize] || of_second[m.second as usize])
+    };
     let of_views = |a: Parts, b: Parts| {
         let mut found = Vec::new();
         for (a, b) in a.into_iter().zip(b) {
             let needed = needed.map(|[of_first, of_second]| [&of_first[a.clone()], &of_second[b.clone()]]);
             match_parts(params, [(first, a), (second, b)], second_from_first, needed, &mut found);
         }
+        found.retain(is_needed);
         found
     };
     let own = of_views(first.0.parts(), second.0.parts());
