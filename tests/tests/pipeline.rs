@@ -218,11 +218,14 @@ fn a_real_set_of_which_one_standpoint_sees_the_scene_gets_its_scale_from_a_facad
     let mut cameras: serde_json::Value = serde_json::from_str(&cameras).unwrap();
     cameras["cameras"]["back"]["params"] = serde_json::json!([1258.7, 1254.4, 800.0, 600.0]);
     std::fs::write(folder.path().join("cameras.json"), cameras.to_string()).unwrap();
+    let store = tempfile::tempdir().unwrap();
+    let session = session(store.path());
     // How well each photo's centre is known, in units of which the panoramas span six.
     let deviations = |scale_by_walls: bool| -> Vec<f64> {
         let mut config = Config::default();
         config.camset.scale_by_walls = scale_by_walls;
-        let figures = bench_with(folder.path(), config);
+        let options = BenchOptions { config, seed: 0, gps: BenchGps::None, joint_reference: false };
+        let figures = bench_dataset(&session, folder.path(), &options).unwrap();
         let deviation = |photo: &PhotoLocalization| {
             let variance = photo.covariance.map(|covariance| covariance.fixed_view::<3, 3>(3, 3).trace());
             photo.world_from_camera.and(variance).map_or(f64::INFINITY, f64::sqrt)
