@@ -156,11 +156,11 @@ const CLEAR_AGREEMENT: f64 = 0.6;
 const MIN_STRENGTH: f64 = 0.2;
 /// The same where most pairs across have the rotation that the similarity gives them.
 const MIN_STRENGTH_OF_PAIRS: f64 = 0.1;
-/// What is expected of the two is out of reach where after the widest band less than this share of it agrees: the narrower ones
-/// show half as much again. Right hypotheses have 0.11 or more there.
-const MIN_HOPE: f64 = 0.05;
 /// Fewest matches that must agree for that, whatever is expected.
 const MIN_STRONG: usize = 60;
+/// What is asked of two parts is out of reach where after the widest band less than this share of it agrees: the narrower ones
+/// show half as much again. Right hypotheses have 0.11 or more there.
+const MIN_HOPE: f64 = 0.05;
 /// How many times more matches must agree when too little is in plain view to be judged by.
 const UNJUDGED_SUPPORT: usize = 2;
 /// Two similarities that differ by less than this share of the distance to what is seen are one.
