@@ -1,6 +1,7 @@
 use setloc_features::DESCRIPTOR_LEN;
 use setloc_sfm::PointId;
 
+use crate::kernel::{TILE, TiledQueries, squared_norm};
 use crate::{NearestPoints, squared_distances};
 
 /// Rows compared at a time: 64 KiB of descriptors stay in the second-level cache for all queries of a tile.
@@ -20,14 +21,19 @@ pub(crate) fn scan_rows(
         let end = range.end.min(start + BLOCK_ROWS);
         let out = &mut distances[..end - start];
         squared_distances(query, &descriptors[start * DESCRIPTOR_LEN..end * DESCRIPTOR_LEN], out);
-        let mut bound = nearest.bound();
-        for (offset, &distance2) in out.iter().enumerate() {
-            if distance2 < bound {
-                nearest.offer(owner(start + offset), distance2);
-                bound = nearest.bound();
-            }
-        }
+        offer(out, start, &owner, nearest);
         start = end;
+    }
+}
+
+/// Offers the rows from `start` on, which are so far off.
+fn offer(distances: &[u32], start: usize, owner: impl Fn(usize) -> PointId, nearest: &mut NearestPoints) {
+    let mut bound = nearest.bound();
+    for (offset, &distance2) in distances.iter().enumerate() {
+        if distance2 < bound {
+            nearest.offer(owner(start + offset), distance2);
+            bound = nearest.bound();
+        }
     }
 }
 
@@ -39,10 +45,23 @@ pub(crate) fn nearest_exact(
 ) -> Vec<NearestPoints> {
     let rows = descriptors.len() / DESCRIPTOR_LEN;
     let mut nearest = vec![NearestPoints::default(); queries.len() / DESCRIPTOR_LEN];
+    let tiled = nearest.len() / TILE * TILE;
+    let (in_tiles, alone) = queries.split_at(tiled * DESCRIPTOR_LEN);
+    let tiles: Vec<TiledQueries> =
+        in_tiles.chunks_exact(TILE * DESCRIPTOR_LEN).map(TiledQueries::new).collect();
+    let mut distances = [[0_u32; BLOCK_ROWS]; TILE];
     let mut start = 0;
     while start < rows {
         let end = rows.min(start + BLOCK_ROWS);
-        for (query, nearest) in queries.chunks_exact(DESCRIPTOR_LEN).zip(&mut nearest) {
+        let base = &descriptors[start * DESCRIPTOR_LEN..end * DESCRIPTOR_LEN];
+        let norms: Vec<i32> = base.as_chunks().0.iter().map(squared_norm).collect();
+        for (tile, nearest) in tiles.iter().zip(nearest.chunks_exact_mut(TILE)) {
+            tile.squared_distances(base, &norms, &mut distances);
+            for (distances, nearest) in distances.iter().zip(nearest) {
+                offer(&distances[..end - start], start, &owner, nearest);
+            }
+        }
+        for (query, nearest) in alone.chunks_exact(DESCRIPTOR_LEN).zip(&mut nearest[tiled..]) {
             scan_rows(query, descriptors, start..end, &owner, nearest);
         }
         start = end;
