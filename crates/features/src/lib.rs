@@ -56,7 +56,7 @@ mod matching;
 mod nearby;
 mod patch;
 mod sift;
-mod vectorized;
+pub mod vectorized;
 
 pub use camera::{
     Calibration, Camera, CameraModel, MAX_CAMERA_PARAMS, ParamRole, PlainRay, ProjectJacobian,
@@ -74,7 +74,7 @@ pub use grey::GreyImage;
 pub use mask::Mask;
 pub use matching::{
     DescriptorBlock, Elevations, GuidedParams, Match, MatchParams, Posture, TwoNearest, match_features,
-    match_guided, match_guided_among, squared_distance, two_nearest, without_carried,
+    match_guided, match_guided_among, squared_distance, squared_norm, two_nearest, without_carried,
 };
 pub use nearby::NearbyKeypoints;
 pub use patch::{Aligned, ImagePyramid, Patch, PatchFrame, PatchParams, Template};

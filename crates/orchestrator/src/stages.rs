@@ -22,8 +22,8 @@ pub const LEFT_APART_VERSION: u32 = 1;
 pub const VERIFY_VERSION: u32 = setloc_sfm::TWO_VIEW_VERSION;
 /// Version of focal lengths by turns on the spot.
 pub const TURNED_VERSION: u32 = 1;
-/// Version of mapping.
-pub const MAPPER_VERSION: u32 = setloc_sfm::MAPPER_VERSION;
+/// Version of mapping and of the guided matching in it.
+pub const MAPPER_VERSION: u32 = 1000 * setloc_features::GuidedParams::VERSION + setloc_sfm::MAPPER_VERSION;
 /// Version of the alignment of tracks.
 pub const ALIGNMENT_VERSION: u32 = setloc_sfm::ALIGNMENT_VERSION;
 /// Version of indexing.

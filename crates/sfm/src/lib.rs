@@ -27,7 +27,7 @@ pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, geor
 pub use ground::{register_by_ground, sharpen_lengths};
 pub use mapper::{
     InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,
-    MergeVerdict, Mosaic, PutativePair, RegistrationRecord, reconstruct,
+    MergeVerdict, Mosaic, PutativePair, Recognition, RegistrationRecord, reconstruct,
 };
 pub use model_errors::{BearingField, ModelErrors, PoseDeviation};
 pub use quality::{

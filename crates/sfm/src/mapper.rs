@@ -47,7 +47,7 @@ pub(crate) use self::adjust::{MIN_ADJUSTABLE_POINTS, MIN_CALIBRATING_POINTS};
 pub(crate) use self::corner::ln_false_alarms;
 pub use self::{
     input::{InputImage, MapperInput, PutativePair},
-    merge::{MergeRecord, MergeVerdict},
+    merge::{MergeRecord, MergeVerdict, Recognition},
     output::{MapperOutput, MapperReport, RegistrationRecord},
     params::MapperParams,
     standpoint::Mosaic,

@@ -10,7 +10,7 @@ use setloc_features::{
 };
 use setloc_sfm::{
     CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, MergeVerdict, PairGeometry,
-    PutativePair, Rigid, Similarity, TwoView, TwoViewParams, reconstruct, verify_pair,
+    PutativePair, Recognition, Rigid, Similarity, TwoView, TwoViewParams, reconstruct, verify_pair,
 };
 
 /// A street of points seen by cameras, with matches between all images that see a point.
@@ -771,6 +771,41 @@ fn measured_positions_may_forbid_to_join() {
     assert_eq!((verdicts(&right), sizes(&right)), (vec![MergeVerdict::Joined], vec![10]));
     let wrong = street.map_halves(5, Across::Few(12), Some(60.0));
     assert_eq!((verdicts(&wrong), sizes(&wrong)), (vec![MergeVerdict::PositionsDisagree], vec![5, 5]));
+}
+
+/// Two halves of a street of which walls let only one in so many points be seen from both; the matched pairs are too few to map
+/// them as one.
+fn map_beside_walls(one_in: usize) -> (Street, MapperOutput) {
+    let mut street = Street::of_panoramas(10, 0.3, 0, 25);
+    let points = street.look.len();
+    street.look.extend(points..2 * points);
+    for image in 5..10 {
+        for point in street.point_of[image].iter_mut().filter(|point| **point % one_in != 0) {
+            *point += points;
+        }
+    }
+    street.describe();
+    let output = street.map_halves(5, Across::Few(12), None);
+    (street, output)
+}
+
+#[test]
+fn halves_that_share_little_beside_walls_are_joined_where_many_matches_agree() {
+    let (street, output) = map_beside_walls(5);
+    let [merge] = &output.report.merges[..] else { panic!("{:?}", output.report.merges) };
+    assert_eq!((merge.verdict, merge.recognition), (MergeVerdict::Joined, Some(Recognition::Strength)));
+    let sentence = merge.sentence().unwrap();
+    assert!(sentence.contains("that is many for the 789 views of points"), "{sentence}");
+    let (registered, worst_m, worst_deg) = street.errors(&output);
+    assert!(registered == 10 && worst_m < 0.02 && worst_deg < 0.02, "{worst_m} m {worst_deg} deg");
+}
+
+#[test]
+fn halves_that_share_next_to_nothing_beside_walls_stay_apart() {
+    let (_, output) = map_beside_walls(16);
+    let [merge] = &output.report.merges[..] else { panic!("{:?}", output.report.merges) };
+    assert_eq!((merge.verdict, merge.recognition), (MergeVerdict::NotRecognized, None));
+    assert_eq!((sizes(&output), merge.sentence()), (vec![5, 5], None));
 }
 
 #[test]

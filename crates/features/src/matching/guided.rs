@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use super::kernel::{TwoNearest, squared_distance};
 use super::{Match, Parts, collect, match_simulated, passes};
-use crate::vectorized::{Level, vectorized};
 use crate::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Rays};
+use crate::{vectorized, vectorized::Level};
 
 /// How to match two images of known relative pose.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -214,7 +214,7 @@ impl<'a> Search<'a> {
 
 vectorized! {
     /// Squared distances of a descriptor from some of an image's.
-    fn squared_distances(query: &[u8], base: &[u8], candidates: &[u32], distances: &mut Vec<u32>) {
+    pub(super) fn squared_distances(query: &[u8], base: &[u8], candidates: &[u32], distances: &mut Vec<u32>) {
         distances.clear();
         distances.resize(candidates.len(), 0);
         // With lengths that are known the loop has no rest.
@@ -228,7 +228,7 @@ vectorized! {
 
 vectorized! {
     /// Sines of the angles between bearings, by their coordinates, and a plane of unit normal.
-    fn sines_to_plane(bearings: [&[f64]; 3], normal: &Vector3<f64>, sines: &mut Vec<f64>) {
+    pub(super) fn sines_to_plane(bearings: [&[f64]; 3], normal: &Vector3<f64>, sines: &mut Vec<f64>) {
         let [x, y, z] = bearings;
         sines.clear();
         sines.resize(x.len(), 0.0);
@@ -425,7 +425,7 @@ mod tests {
         let query = &descriptors[DESCRIPTOR_LEN..2 * DESCRIPTOR_LEN];
         let of = |at: &u32| &descriptors[*at as usize * DESCRIPTOR_LEN..][..DESCRIPTOR_LEN];
         let expected: Vec<u32> = candidates.iter().map(|at| squared_distance(query, of(at))).collect();
-        for level in [Level::Baseline, Level::detect()] {
+        for level in [Level::BASELINE, Level::detect()] {
             let mut distances = Vec::new();
             squared_distances(level, query, descriptors, &candidates, &mut distances);
             assert_eq!(distances, expected, "{level:?}");

@@ -375,7 +375,8 @@ pub(super) fn two_nearest_both(
     DescriptorBlock::with_kernel(Kernel::detect_for(queries, base), base).search(queries, compared, true)
 }
 
-pub(super) fn squared_norm(descriptor: &[u8]) -> i32 {
+/// Squared Euclidean norm of a descriptor; at most 128 · 255² < 2²³.
+pub fn squared_norm(descriptor: &[u8]) -> i32 {
     descriptor.iter().map(|&value| i32::from(value) * i32::from(value)).sum()
 }
 

@@ -1,7 +1,7 @@
 //! Separable Gaussian blurring.
 
 use super::plane::{BLOCK, Plane};
-use crate::vectorized::{Level, vectorized};
+use crate::{vectorized, vectorized::Level};
 
 /// Rows that are blurred together; even.
 pub(super) const GROUP: usize = 16;
@@ -52,7 +52,7 @@ impl Blur {
 }
 
 vectorized! {
-    fn blur_rows(
+    pub(super) fn blur_rows(
         weights: &[f32],
         source: &Plane,
         target: &mut Plane,
@@ -184,7 +184,7 @@ mod tests {
         for (width, height) in [(130, 21), (64, 35), (64, 5), (3, 2), (1, 1)] {
             let (source, weights) = (wavy(width, height), gaussian(1.3));
             let target = blurred(Level::detect(), 1.3, &source);
-            let baseline = blurred(Level::Baseline, 1.3, &source);
+            let baseline = blurred(Level::BASELINE, 1.3, &source);
             for y in 0..height {
                 assert_eq!(target.row(y), baseline.row(y));
             }

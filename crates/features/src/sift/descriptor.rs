@@ -3,7 +3,7 @@ use std::ops::RangeInclusive;
 use super::orientation::gradients_of_block;
 use super::plane::{Kept, LANES, Plane};
 use crate::DESCRIPTOR_LEN;
-use crate::vectorized::{Level, vectorized};
+use crate::{vectorized, vectorized::Level};
 
 /// Spatial cells along each side.
 const CELLS: usize = 4;
@@ -94,7 +94,7 @@ pub(super) fn describe(
 
 vectorized! {
     /// Adds the gradients of all pixels within the cells.
-    fn accumulate(
+    pub(super) fn accumulate(
         plane: &Plane<Kept>,
         frame: &Frame,
         rows: &mut DescriptorRows,

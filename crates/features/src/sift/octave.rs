@@ -126,13 +126,13 @@ mod tests {
         let whole = |from: &Plane, sigma: f64| {
             let (mut target, mut blur) = (Plane::default(), Blur::new(sigma));
             target.resize(width, height);
-            while blur.advance(Level::Baseline, from, height, &mut target) < height {}
+            while blur.advance(Level::BASELINE, from, height, &mut target) < height {}
             target
         };
         let mut photo = Plane::default();
         photo.resize(width, height);
         for y in 0..height {
-            image.put_row(Level::Baseline, y, &mut Vec::new(), photo.row_mut(y));
+            image.put_row(Level::BASELINE, y, &mut Vec::new(), photo.row_mut(y));
         }
         let mut expected = vec![whole(&photo, sigmas.first)];
         for &sigma in &sigmas.steps {

@@ -1,6 +1,6 @@
 use super::Extremum;
 use super::plane::{Kept, LANES, Plane, grey};
-use crate::vectorized::{Level, vectorized};
+use crate::{vectorized, vectorized::Level};
 
 /// Directions of the histogram.
 const BINS: usize = 36;
@@ -65,7 +65,7 @@ pub(super) fn orientations(
 }
 
 vectorized! {
-    fn gradients(plane: &Plane<Kept>, y: usize, left: usize, magnitudes: &mut [[f32; LANES]], bins: &mut [[f32; LANES]]) {
+    pub(super) fn gradients(plane: &Plane<Kept>, y: usize, left: usize, magnitudes: &mut [[f32; LANES]], bins: &mut [[f32; LANES]]) {
         for (block, (magnitudes, bins)) in magnitudes.iter_mut().zip(bins).enumerate() {
             (*magnitudes, *bins) = gradients_of_block(plane, y, left + block * LANES, BINS as f32);
         }

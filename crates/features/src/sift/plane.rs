@@ -1,6 +1,6 @@
 use std::ops::Range;
 
-use crate::vectorized::{Level, vectorized};
+use crate::{vectorized, vectorized::Level};
 
 /// Columns that are blurred together; rows have room for whole blocks of them.
 pub(super) const BLOCK: usize = 32;
@@ -108,7 +108,7 @@ pub(super) fn grey(kept: Kept) -> f32 {
 }
 
 vectorized! {
-    fn keep(row: &[f32], target: &mut [Kept]) {
+    pub(super) fn keep(row: &[f32], target: &mut [Kept]) {
         // In floats of this size the last bit is worth 1; compilers turn conversions that must bear any number into single ones.
         const ROUNDING: f32 = 8_388_608.0;
         for (target, &value) in target.iter_mut().zip(row) {
@@ -137,7 +137,7 @@ mod tests {
     #[test]
     fn kept_values_are_grey_values_to_half_a_step() {
         let row: Vec<f32> = (0..5000).map(|at| at as f32 * 0.051).collect();
-        for level in [Level::detect(), Level::Baseline] {
+        for level in [Level::detect(), Level::BASELINE] {
             let mut plane: Plane<Kept> = Plane::default();
             plane.resize(row.len(), 2);
             plane.keep(level, 1, &row);

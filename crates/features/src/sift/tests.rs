@@ -179,5 +179,5 @@ fn all_levels_give_the_same_bits() {
         let descriptors = space.describe(level, &PARAMS, &points);
         (format!("{points:?}"), descriptors)
     };
-    assert_eq!(run(Level::Baseline), run(Level::detect()));
+    assert_eq!(run(Level::BASELINE), run(Level::detect()));
 }

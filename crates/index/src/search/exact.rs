@@ -1,11 +1,8 @@
-use setloc_features::DESCRIPTOR_LEN;
+use setloc_features::{DESCRIPTOR_LEN, squared_norm, vectorized::Level};
 use setloc_sfm::PointId;
 
-use crate::kernel::{TILE, TiledQueries, squared_norm};
+use crate::kernel::{BLOCK_ROWS, TILE, TiledQueries};
 use crate::{NearestPoints, squared_distances};
-
-/// Rows compared at a time: 64 KiB of descriptors stay in the second-level cache for all queries of a tile.
-const BLOCK_ROWS: usize = 512;
 
 /// Offers the rows `range` of `descriptors` (row-major, `owner[row]` each row's point) to one query.
 pub(crate) fn scan_rows(
@@ -49,14 +46,15 @@ pub(crate) fn nearest_exact(
     let (in_tiles, alone) = queries.split_at(tiled * DESCRIPTOR_LEN);
     let tiles: Vec<TiledQueries> =
         in_tiles.chunks_exact(TILE * DESCRIPTOR_LEN).map(TiledQueries::new).collect();
+    let level = Level::detect();
     let mut distances = [[0_u32; BLOCK_ROWS]; TILE];
     let mut start = 0;
     while start < rows {
         let end = rows.min(start + BLOCK_ROWS);
         let base = &descriptors[start * DESCRIPTOR_LEN..end * DESCRIPTOR_LEN];
-        let norms: Vec<i32> = base.as_chunks().0.iter().map(squared_norm).collect();
+        let norms: Vec<i32> = base.chunks_exact(DESCRIPTOR_LEN).map(squared_norm).collect();
         for (tile, nearest) in tiles.iter().zip(nearest.chunks_exact_mut(TILE)) {
-            tile.squared_distances(base, &norms, &mut distances);
+            tile.squared_distances(level, base, &norms, &mut distances);
             for (distances, nearest) in distances.iter().zip(nearest) {
                 offer(&distances[..end - start], start, &owner, nearest);
             }

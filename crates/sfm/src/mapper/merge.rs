@@ -64,6 +64,17 @@ pub enum MergeVerdict {
     Contradicted,
 }
 
+/// What two components that were joined by matches were told to be of one place by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Recognition {
+    /// Most of what either ought to see of the other was matched.
+    Likeness,
+    /// So many matches agree that walls are what hides the rest.
+    Strength,
+    /// Images that stand next to each other share what neighbours do.
+    Neighbours,
+}
+
 /// An attempt to join two components.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MergeRecord {
@@ -73,6 +84,8 @@ pub struct MergeRecord {
     pub images: [usize; 2],
     /// What became of it.
     pub verdict: MergeVerdict,
+    /// What told that they are of one place, where they were [joined](MergeVerdict::Joined).
+    pub recognition: Option<Recognition>,
     /// Matches between them, of which at least one keypoint carries a point; those of one point with one other count
     /// once.
     pub candidates: usize,
@@ -104,29 +117,24 @@ impl MergeRecord {
                 self.inliers
             ));
         }
-        (self.verdict == MergeVerdict::Joined).then(|| {
-            let (found, expected) = (self.found_matches, self.expected_matches);
-            let is_recognized =
-                expected < MIN_EXPECTED_MATCHES || found >= MIN_LIKENESS_OF_PAIRS * expected;
-            let shared = if is_recognized {
+        let (found, expected) = (self.found_matches, self.expected_matches);
+        let shared = match self.recognition? {
+            Recognition::Likeness => {
                 format!("they share {found:.0} of the {expected:.0} views of points that they ought to")
-            } else if outweighs_walls(self.inliers, expected, MIN_STRENGTH_OF_PAIRS) {
-                format!(
-                    "that is many for the {expected:.0} views of points that there would be with nothing between, of \
-                     which they share {found:.0}"
-                )
-            } else {
-                format!(
-                    "panoramas that stand next to each other share what neighbours do (of the {expected:.0} views of \
-                     points that there would be with nothing between, {found:.0})"
-                )
-            };
-            format!(
-                "parts of {larger} and {smaller} images were joined: {} matches between them agree on one place, and \
-                 {shared}",
-                self.inliers
-            )
-        })
+            }
+            Recognition::Strength => format!(
+                "that is many for the {expected:.0} views of points that there would be with nothing between, of which \
+                 they share {found:.0}"
+            ),
+            Recognition::Neighbours => format!(
+                "panoramas that stand next to each other share what neighbours do (of the {expected:.0} views of points \
+                 that there would be with nothing between, {found:.0})"
+            ),
+        };
+        Some(format!(
+            "parts of {larger} and {smaller} images were joined: {} matches between them agree on one place, and {shared}",
+            self.inliers
+        ))
     }
 }
 
@@ -303,15 +311,15 @@ impl<'a> Attempt<'_, '_, 'a> {
             return None;
         }
         let mut hypotheses = self.hypotheses(&crossings);
-        let mut verdicts: Vec<MergeVerdict> =
+        let mut judged: Vec<Result<Recognition, MergeVerdict>> =
             hypotheses.iter().map(|hypothesis| self.judge(&crossings, hypothesis)).collect();
-        if !verdicts.contains(&MergeVerdict::Joined)
+        if !judged.iter().any(Result::is_ok)
             && let Some(local) = self.local_hypothesis(&crossings)
         {
-            verdicts.push(self.judge(&crossings, &local));
+            judged.push(self.judge(&crossings, &local));
             hypotheses.push(local);
         }
-        let mut fit = verdicts.iter().enumerate().filter(|(_, verdict)| **verdict == MergeVerdict::Joined);
+        let mut fit = judged.iter().enumerate().filter(|(_, judged)| judged.is_ok());
         let first = fit.next().map(|(at, _)| at);
         let rival =
             fit.any(|(at, _)| first.is_some_and(|first| self.differ(&hypotheses[first], &hypotheses[at])));
@@ -320,14 +328,15 @@ impl<'a> Attempt<'_, '_, 'a> {
         if first.is_some() {
             joined = if rival { None } else { self.join(&hypotheses[best], taken) };
             if joined.is_none() {
-                verdicts[best] = if rival { MergeVerdict::Ambiguous } else { MergeVerdict::Contradicted };
+                judged[best] = Err(if rival { MergeVerdict::Ambiguous } else { MergeVerdict::Contradicted });
             }
         }
         let best_found = hypotheses.get(best);
         let seen = best_found.map(|hypothesis| hypothesis.seen).unwrap_or_default();
         let likeness = best_found.map(|hypothesis| hypothesis.likeness).unwrap_or_default();
-        let verdict = verdicts.get(best).copied().unwrap_or(MergeVerdict::Unsupported);
+        let judged = judged.get(best).copied().unwrap_or(Err(MergeVerdict::Unsupported));
         report.merges.push(MergeRecord {
+            recognition: judged.ok(),
             candidates,
             inliers: best_found.map_or(0, |hypothesis| hypothesis.support),
             expected: seen.map(|seen| seen.expected),
@@ -336,7 +345,7 @@ impl<'a> Attempt<'_, '_, 'a> {
             matched_cells: seen.map(|seen| seen.matched_cells),
             expected_matches: likeness.expected,
             found_matches: likeness.matched,
-            ..self.record(verdict)
+            ..self.record(judged.err().unwrap_or(MergeVerdict::Joined))
         });
         let mut mapper = joined?;
         report.registrations.append(&mut mapper.records);
@@ -350,6 +359,7 @@ impl<'a> Attempt<'_, '_, 'a> {
             first_images: [first_of(self.kept), first_of(self.moved)],
             images: [self.kept.size(), self.moved.size()],
             verdict,
+            recognition: None,
             candidates: 0,
             inliers: 0,
             expected: [0; 2],
@@ -441,6 +451,7 @@ impl<'a> Attempt<'_, '_, 'a> {
         let bound = self.params.max_error_sigma;
         let mut agreeing = self.sides.agreeing(crossings, &kept_from_moved, bound);
         let seen = self.seen(&kept_from_moved, &agreeing);
+        let mut likeness = self.likeness(&kept_from_moved, &agreeing);
         if distinct(&agreeing) >= MIN_SEED {
             for max_angle_rad in GUIDED_BANDS_RAD {
                 let guide = GuidedParams { max_angle_rad, ..GuidedParams::default() };
@@ -449,14 +460,13 @@ impl<'a> Attempt<'_, '_, 'a> {
                 let all = once(all);
                 kept_from_moved = self.refined(&all, kept_from_moved);
                 agreeing = self.sides.agreeing(&all, &kept_from_moved, bound);
-                let Likeness { expected, matched } = self.likeness(&kept_from_moved, &agreeing);
-                if (distinct(&agreeing) as f64).max(matched) < MIN_HOPE * expected {
+                likeness = self.likeness(&kept_from_moved, &agreeing);
+                if (distinct(&agreeing) as f64).max(likeness.matched) < MIN_HOPE * likeness.expected {
                     break;
                 }
             }
         }
         let support = distinct(&agreeing);
-        let likeness = self.likeness(&kept_from_moved, &agreeing);
         Hypothesis { kept_from_moved, agreeing, support, seen, likeness }
     }
 
@@ -513,21 +523,36 @@ impl<'a> Attempt<'_, '_, 'a> {
             + likeness(kept, moved, &kept_from_moved.inverse(), &by_kept)
     }
 
-    fn judge(&self, crossings: &[Crossing], hypothesis: &Hypothesis) -> MergeVerdict {
+    /// What tells that the two are of one place, or why they are not joined.
+    fn judge(&self, crossings: &[Crossing], hypothesis: &Hypothesis) -> Result<Recognition, MergeVerdict> {
         let params = self.params;
-        let Hypothesis { kept_from_moved, agreeing, support, seen, likeness } = hypothesis;
+        let Hypothesis { kept_from_moved, agreeing, support, .. } = hypothesis;
         if *support < params.min_registration_inliers {
-            return MergeVerdict::Unsupported;
+            return Err(MergeVerdict::Unsupported);
         }
         let sights = Sights::collect(&self.sides, agreeing.iter());
         let sigma = sights.log_scale_sigma(kept_from_moved, params.loss_sigma);
         if !(self.is_spread(agreeing) && sigma <= MAX_LOG_SCALE_SIGMA) {
-            return MergeVerdict::ScaleOpen;
+            return Err(MergeVerdict::ScaleOpen);
         }
+        let recognition = self.recognition(crossings, hypothesis).ok_or(MergeVerdict::NotRecognized)?;
+        if self.pair_agreement(kept_from_moved) < params.min_pair_agreement {
+            return Err(MergeVerdict::PairsDisagree);
+        }
+        if self.positions_disagree(kept_from_moved) {
+            return Err(MergeVerdict::PositionsDisagree);
+        }
+        Ok(recognition)
+    }
+
+    /// What tells that the two are of one place, if anything does.
+    fn recognition(&self, crossings: &[Crossing], hypothesis: &Hypothesis) -> Option<Recognition> {
+        let params = self.params;
+        let Hypothesis { kept_from_moved, agreeing, support, seen, likeness } = hypothesis;
         let is_judged = |seen: &Visibility| seen.expected >= params.min_visible_points;
-        let pair_agreement = self.pair_agreement(kept_from_moved);
-        let is_recognized = if likeness.expected >= MIN_EXPECTED_MATCHES {
-            let least = if pair_agreement >= CLEAR_AGREEMENT { MIN_LIKENESS_OF_PAIRS } else { MIN_LIKENESS };
+        let is_alike = if likeness.expected >= MIN_EXPECTED_MATCHES {
+            let is_clear = self.pair_agreement(kept_from_moved) >= CLEAR_AGREEMENT;
+            let least = if is_clear { MIN_LIKENESS_OF_PAIRS } else { MIN_LIKENESS };
             likeness.matched >= least * likeness.expected
         } else if seen.iter().any(is_judged) {
             seen.iter().all(|seen| !is_judged(seen) || params.is_recognized(seen))
@@ -536,19 +561,14 @@ impl<'a> Attempt<'_, '_, 'a> {
             let confirmed = verified(agreeing) >= params.min_confirmed_share * verified(crossings);
             confirmed && *support >= UNJUDGED_SUPPORT * params.min_registration_inliers
         };
-        if !is_recognized
-            && !self.is_strong(*support, hypothesis)
-            && !self.share_as_neighbours(|image| self.pose_in_kept(image, kept_from_moved))
-        {
-            return MergeVerdict::NotRecognized;
+        if is_alike {
+            return Some(Recognition::Likeness);
         }
-        if pair_agreement < params.min_pair_agreement {
-            return MergeVerdict::PairsDisagree;
+        if self.is_strong(*support, hypothesis) {
+            return Some(Recognition::Strength);
         }
-        if self.positions_disagree(kept_from_moved) {
-            return MergeVerdict::PositionsDisagree;
-        }
-        MergeVerdict::Joined
+        self.share_as_neighbours(|image| self.pose_in_kept(image, kept_from_moved))
+            .then_some(Recognition::Neighbours)
     }
 
     /// Whether so many matches agree that two parts are of one place, though either sees little of what the other does.
