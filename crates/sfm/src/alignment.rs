@@ -24,17 +24,18 @@ use setloc_features::{
 };
 
 use crate::{
-    AlignedTrack, ImageId, Observation, Place, Reconstruction, Rigid,
+    AlignedTrack, ImageId, MeasuredPositions, Observation, Place, Reconstruction, Rigid,
     bundle::{
         self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, CameraPrior,
         IntrinsicsFreedom, RobustLoss,
     },
     mapper::MIN_ADJUSTABLE_POINTS,
+    model_errors::moved_alike,
     solvers::tangent_basis,
 };
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 21;
+pub const ALIGNMENT_VERSION: u32 = 22;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;
@@ -109,7 +110,8 @@ pub struct AlignmentReport {
 /// Aligns the tracks of a component and adjusts it.
 ///
 /// `features` are those of the component's images, by id; `camera_fixed` says whose intrinsics are known, and those of
-/// cameras beyond its end, which the mapper added, are not. `load` gives the pixels of a registered image and may be called
+/// cameras beyond its end, which the mapper added, are not. `positions` are in the frame of the component, which moves in it by
+/// little. `load` gives the pixels of a registered image and may be called
 /// five times for each, from several threads.
 ///
 /// In a component in which photos share a standpoint nothing moves, as what ties their centres together is not known
@@ -122,6 +124,7 @@ pub fn align_tracks<E: Send>(
     component: &mut Reconstruction,
     features: &[&ImageFeatures],
     camera_fixed: &[bool],
+    positions: Option<MeasuredPositions<'_>>,
     load: impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync,
 ) -> Result<AlignmentReport, E> {
     let registered: Vec<ImageId> = component.registered().collect();
@@ -156,7 +159,7 @@ pub fn align_tracks<E: Send>(
     };
     let first = BundleParams { function_tolerance: FIRST_TOLERANCE, ..bundle };
     let mut problem = tracks.problem(camera_fixed, &aligned, &tracks.middles(&aligned), &[]);
-    bundle::solve(&first, &mut problem);
+    solve(&first, &mut problem, tracks.component, positions);
     let (references, planes) = (tracks.references, tracks.planes);
     store(component, features, &problem);
     // Now it is known where the patches lie in views that no keypoint ties to them.
@@ -168,7 +171,7 @@ pub fn align_tracks<E: Send>(
     .concat();
     report.further = further.len();
     let mut problem = tracks.problem(camera_fixed, &aligned, &middles, &further);
-    bundle::solve(&bundle, &mut problem);
+    solve(&bundle, &mut problem, tracks.component, positions);
     let placed = tracks.placed(&aligned, &middles, &further);
     store(component, features, &problem);
     for (point, placed) in component.points.iter_mut().zip(placed) {
@@ -230,6 +233,62 @@ pub(crate) fn adjustable_poses(
         }
     }
     (poses, pose_of_image)
+}
+
+/// Adjusts a component, by measured positions, too, where there are.
+fn solve(
+    params: &BundleParams,
+    problem: &mut BundleProblem,
+    component: &Reconstruction,
+    positions: Option<MeasuredPositions<'_>>,
+) {
+    let Some(positions) = positions else {
+        bundle::solve(params, problem);
+        return;
+    };
+    hold_by_positions(problem, component, &positions, params.loss);
+    let before = problem.poses.clone();
+    bundle::solve(params, problem);
+    follow(problem, &before);
+}
+
+/// Frees the frame of a component's adjustment and holds it by measured positions.
+///
+/// Poses that see too little to be adjusted would hold it fast: they are left out, and follow ([`follow`]).
+pub(crate) fn hold_by_positions(
+    problem: &mut BundleProblem,
+    component: &Reconstruction,
+    positions: &MeasuredPositions<'_>,
+    loss: RobustLoss,
+) {
+    let mut pose_of_image = vec![None; component.images.len()];
+    for (pose, image) in (0..).zip(component.registered()) {
+        pose_of_image[image.index()] = Some(pose);
+    }
+    let mut seen = vec![0; problem.poses.len()];
+    problem.observations.iter().for_each(|observation| seen[observation.pose as usize] += 1);
+    for (pose, seen) in problem.poses.iter_mut().zip(seen) {
+        pose.fixed = seen < MIN_ADJUSTABLE_POINTS;
+    }
+    let poses = &problem.poses;
+    problem.observations.retain(|seen| !poses[seen.pose as usize].fixed);
+    problem.position_priors = positions.priors(&pose_of_image, problem.variance_factor(loss));
+}
+
+/// Moves the poses of a problem that were left out of its adjustment as the nearest of the others has moved since `before`.
+fn follow(problem: &mut BundleProblem, before: &[BundlePose]) {
+    let moved: Vec<(Rigid, Rigid)> = (before.iter().zip(&problem.poses))
+        .filter(|(before, _)| !before.fixed)
+        .map(|(before, after)| (before.world_from_camera, after.world_from_camera))
+        .collect();
+    for pose in problem.poses.iter_mut().filter(|pose| pose.fixed) {
+        let here = pose.world_from_camera.translation;
+        let distance = |of: &Rigid| (of.translation - here).norm_squared();
+        let nearest = moved.iter().min_by(|a, b| distance(&a.0).total_cmp(&distance(&b.0)));
+        if let Some((before, after)) = nearest {
+            pose.world_from_camera = moved_alike(&pose.world_from_camera, before, after);
+        }
+    }
 }
 
 /// Whether two images have one centre, as photos turned on the spot do.

@@ -23,7 +23,7 @@ mod walls;
 
 pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, align_tracks};
 pub use geometry::{Rigid, Similarity, nearest_rotation};
-pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, georegister};
+pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, MeasuredPositions, georegister};
 pub use ground::{register_by_ground, sharpen_lengths};
 pub use mapper::{
     InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,

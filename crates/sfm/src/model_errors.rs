@@ -25,13 +25,14 @@ mod shared;
 
 pub use self::shared::BearingField;
 use self::shared::{moved, shared_sigma_rad};
-use crate::alignment::{adjustable_poses, shares_standpoints};
+use crate::alignment::{adjustable_poses, hold_by_positions, shares_standpoints};
 use crate::bundle::{
     self, BundleObservation, BundlePoint, BundleProblem, CameraPrior, IntrinsicsFreedom, RobustLoss,
 };
 use crate::synthetic::normal;
 use crate::{
-    BaselineLength, ImageId, Place, Reconstruction, ReconstructionPoint, Rigid, Similarity, nearest_rotation,
+    BaselineLength, ImageId, MeasuredPositions, Place, Reconstruction, ReconstructionPoint, Rigid,
+    Similarity, nearest_rotation,
 };
 
 /// Draws of the errors.
@@ -64,14 +65,19 @@ impl ModelErrors {
     ///
     /// Intrinsics stay as they are, but for how panoramas are stretched: that was told by the same bearings. What whole
     /// hemispheres share besides is not in it, as the poses take it up; nor is a fold.
-    pub fn of_model(model: &Reconstruction) -> Option<Self> {
+    ///
+    /// `positions` are those that it was adjusted to, too; what *all* of them are off is in no draw.
+    pub fn of_model(model: &Reconstruction, positions: Option<MeasuredPositions<'_>>) -> Option<Self> {
         let images: Vec<ImageId> = model.registered().collect();
         if shares_standpoints(model, &images) {
             return None;
         }
-        let (places, pose_of_image) = problem_of(model);
+        let (mut places, pose_of_image) = problem_of(model);
+        if let Some(positions) = positions {
+            hold_by_positions(&mut places, model, &positions, LOSS);
+        }
         let problem = places.reweighted(LOSS);
-        let residuals = places.residuals_under(LOSS);
+        let (residuals, position_residuals) = (places.residuals_under(LOSS), places.position_residuals());
         let mut unmoved = problem.clone();
         hold_lengths(&mut unmoved, model, &pose_of_image, |_| 1.0);
         if problem.observations.is_empty() || !bundle::step(&mut unmoved) {
@@ -94,6 +100,9 @@ impl ModelErrors {
             }
             let off = |deviation: f64| (deviation * normal(&mut rng)).exp();
             hold_lengths(&mut drawn, model, &pose_of_image, off);
+            for (prior, residual) in drawn.position_priors.iter_mut().zip(&position_residuals) {
+                prior.position += residual * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+            }
             // What has no answer to one draw has none to the unmoved places either.
             if !bundle::step(&mut drawn) {
                 drawn.clone_from(&unmoved);
@@ -249,7 +258,7 @@ fn common_frame(pairs: &[(Rigid, Rigid)]) -> Similarity {
 }
 
 /// A pose moved as another one is from before to after.
-fn moved_alike(pose: &Rigid, before: &Rigid, after: &Rigid) -> Rigid {
+pub(crate) fn moved_alike(pose: &Rigid, before: &Rigid, after: &Rigid) -> Rigid {
     let turn = after.rotation * before.rotation.inverse();
     Rigid::new(turn * pose.rotation, pose.translation + after.translation - before.translation)
 }
@@ -268,7 +277,9 @@ mod tests {
     use super::*;
     use nalgebra::{UnitQuaternion, Vector2};
 
-    use crate::{AlignedTrack, CameraId, Observation, ReconstructionImage};
+    use crate::{
+        AlignedTrack, CameraId, GeoregisterParams, MeasuredPosition, Observation, ReconstructionImage,
+    };
 
     /// Panoramas along a street between façades, whose places have noise of their own and shared errors, adjusted.
     fn street(noise_px: f64, shared_rad: f64, seed: u64) -> (Reconstruction, Vec<Rigid>) {
@@ -276,8 +287,33 @@ mod tests {
     }
 
     fn street_of(camera: &Camera, noise_px: f64, shared_rad: f64, seed: u64) -> (Reconstruction, Vec<Rigid>) {
+        let (mut model, truth) = seen_street(6, camera, noise_px, shared_rad, seed);
+        let (mut problem, _) = problem_of(&model);
+        bundle::solve(&bundle::BundleParams::default(), &mut problem);
+        take(&mut model, &problem);
+        (model, truth)
+    }
+
+    fn take(model: &mut Reconstruction, problem: &BundleProblem) {
+        for (image, adjusted) in model.images.iter_mut().zip(&problem.poses) {
+            image.world_from_camera = Some(adjusted.world_from_camera);
+        }
+        for (point, adjusted) in model.points.iter_mut().zip(&problem.points) {
+            point.position = adjusted.position;
+        }
+        model.cameras.clone_from(&problem.cameras);
+    }
+
+    /// The same of so many panoramas, as it truly is.
+    fn seen_street(
+        count: u32,
+        camera: &Camera,
+        noise_px: f64,
+        shared_rad: f64,
+        seed: u64,
+    ) -> (Reconstruction, Vec<Rigid>) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let truth: Vec<Rigid> = (0..6)
+        let truth: Vec<Rigid> = (0..count)
             .map(|at| {
                 let turn = UnitQuaternion::from_euler_angles(0.0, 0.4 * f64::from(at), 0.0);
                 Rigid::new(turn, Vector3::new(0.1 * f64::from(at % 2), 0.0, 3.0 * f64::from(at)))
@@ -288,19 +324,20 @@ mod tests {
             camera: CameraId(0),
             world_from_camera: Some(*pose),
         };
-        let fields: Vec<BearingField> =
-            (0..6).map(|image| BearingField::new(shared_rad, ImageId(image), 1000 + seed as u32)).collect();
+        let fields: Vec<BearingField> = (0..count)
+            .map(|image| BearingField::new(shared_rad, ImageId(image), 1000 + seed as u32))
+            .collect();
         let mut model = Reconstruction {
             cameras: vec![camera.clone()],
             images: truth.iter().enumerate().map(image).collect(),
             ..Reconstruction::default()
         };
-        for feature in 0..1500 {
+        for feature in 0..250 * count {
             let side = if rng.random_bool(0.5) { 6.0 } else { -6.0 };
             let position = Vector3::new(
                 side + rng.random_range(-0.5..0.5),
                 rng.random_range(-6.0..1.5),
-                rng.random_range(-6.0..21.0),
+                rng.random_range(-6.0..3.0 * f64::from(count) + 3.0),
             );
             let mut point = ReconstructionPoint {
                 position,
@@ -326,21 +363,12 @@ mod tests {
                 model.points.push(point);
             }
         }
-        let (mut problem, _) = problem_of(&model);
-        bundle::solve(&bundle::BundleParams::default(), &mut problem);
-        for (image, pose) in model.images.iter_mut().zip(&problem.poses) {
-            image.world_from_camera = Some(pose.world_from_camera);
-        }
-        for (point, refined) in model.points.iter_mut().zip(&problem.points) {
-            point.position = refined.position;
-        }
-        model.cameras = problem.cameras;
         (model, truth)
     }
 
     #[test]
     fn what_has_no_places_has_no_errors() {
-        assert_eq!(ModelErrors::of_model(&Reconstruction::default()), None);
+        assert_eq!(ModelErrors::of_model(&Reconstruction::default(), None), None);
     }
 
     #[test]
@@ -368,7 +396,7 @@ mod tests {
         let (mut squared, mut expected) = ([0.0; 2], [0.0; 2]);
         for seed in 0..4 {
             let (model, truth) = street(noise_px, shared_rad, seed);
-            let errors = ModelErrors::of_model(&model).expect("has places");
+            let errors = ModelErrors::of_model(&model, None).expect("has places");
             check(&errors);
             let estimated = model.images.iter().map(|image| image.world_from_camera.unwrap());
             let pairs: Vec<(Rigid, Rigid)> = estimated.zip(truth).collect();
@@ -385,6 +413,58 @@ mod tests {
         [squared[0] / expected[0], squared[1] / expected[1]]
     }
 
+    /// Bearings that are off together bend a long street, which positions that are off by more, each by its own, do not let it.
+    #[test]
+    fn measured_positions_hold_a_long_street() {
+        let params = GeoregisterParams { gps_sigma_m: 0.1, ..GeoregisterParams::default() };
+        let camera = Camera::equirectangular(4096, 2048);
+        let (mut apart, mut held, mut ratio) = (0.0, 0.0, 0.0);
+        for seed in 0..3 {
+            let (seen, truth) = seen_street(60, &camera, 0.2, 1e-3, seed);
+            let mut rng = ChaCha8Rng::seed_from_u64(100 + seed);
+            let mut off = || params.gps_sigma_m * normal(&mut rng);
+            let measured: Vec<Option<MeasuredPosition>> = (truth.iter().enumerate())
+                .map(|(at, pose)| {
+                    // One of them is wrong, and two have no height.
+                    let wrong = if at == 17 { 30.0 } else { 0.0 };
+                    let enu = pose.translation + Vector3::new(off() + wrong, off(), off());
+                    Some(MeasuredPosition { enu, has_height: at % 20 != 3 })
+                })
+                .collect();
+            let positions = MeasuredPositions { params: &params, by_image: &measured };
+            let adjustment = bundle::BundleParams {
+                loss: LOSS,
+                max_iterations: 200,
+                function_tolerance: 1e-7,
+                ..bundle::BundleParams::default()
+            };
+            let adjusted = |positions: Option<MeasuredPositions<'_>>| {
+                let (mut model, mut problem) = (seen.clone(), problem_of(&seen).0);
+                if let Some(positions) = positions {
+                    hold_by_positions(&mut problem, &seen, &positions, adjustment.loss);
+                }
+                bundle::solve(&adjustment, &mut problem);
+                take(&mut model, &problem);
+                let found = problem.poses.iter().map(|pose| pose.world_from_camera);
+                let pairs: Vec<(Rigid, Rigid)> = found.zip(truth.iter().copied()).collect();
+                let frame = common_frame(&pairs);
+                let off = |(found, truth): &(Rigid, Rigid)| {
+                    (found.translation - frame.transform_pose(truth).translation).norm_squared()
+                };
+                (model, pairs.iter().map(off).sum::<f64>() / pairs.len() as f64)
+            };
+            apart += adjusted(None).1;
+            let (model, squared) = adjusted(Some(positions));
+            held += squared;
+            let errors = ModelErrors::of_model(&model, Some(positions)).expect("has places");
+            let stated =
+                |image| errors.deviation(&model, ImageId(image)).expect("is registered").center.powi(2);
+            ratio += squared / ((0..60).map(stated).sum::<f64>() / 60.0) / 3.0;
+        }
+        assert!(held < 0.5 * apart, "{held} {apart}");
+        assert!((0.3..3.0).contains(&ratio), "{ratio}");
+    }
+
     #[test]
     fn how_far_a_stretch_may_be_off_is_told() {
         let mut camera = Camera::equirectangular(4096, 2048).as_stitched().unwrap();
@@ -396,7 +476,7 @@ mod tests {
         let (mut squared, mut expected) = (0.0, 0.0);
         for seed in 0..6 {
             let (model, _) = street_of(&camera, 0.2, 4e-4, seed);
-            let errors = ModelErrors::of_model(&model).expect("are shown");
+            let errors = ModelErrors::of_model(&model, None).expect("are shown");
             squared += apart(&model.cameras[0], &camera);
             for draw in 0..errors.draws() {
                 let drawn = &errors.cameras[draw as usize][0];

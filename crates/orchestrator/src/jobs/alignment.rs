@@ -10,6 +10,7 @@ use setloc_features::ImageFeatures;
 use setloc_sfm::{AlignmentParams, ImageId, MapperOutput, align_tracks, register_by_ground, sharpen_lengths};
 
 use super::model::{features_role, image_of_place_holder, read_unchanged};
+use super::positions::Measurements;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
@@ -24,10 +25,10 @@ const WORKING_BYTES: u64 = 8;
 pub(super) fn add_alignment(
     graph: &mut JobGraph<'_>,
     images: &[SourceImage],
-    features: &[JobId],
-    model: JobId,
+    (features, model): (&[JobId], JobId),
     camera_fixed: Vec<bool>,
     params: &AlignmentParams,
+    measured: Measurements,
 ) -> JobId {
     let external =
         images.iter().enumerate().map(|(at, image)| (format!("image {at:04}"), image.hash)).collect();
@@ -36,9 +37,14 @@ pub(super) fn add_alignment(
     let memory = pixels.sum::<u64>().min(KEPT_BYTES as u64) + 2 * WORKING_BYTES * largest;
     let sources: Vec<(PathBuf, ContentHash)> =
         images.iter().map(|image| (image.path.clone(), image.hash)).collect();
-    let job_params = json!({ "alignment": params, "camera_fixed": camera_fixed });
+    let mut job_params = json!({ "alignment": params, "camera_fixed": camera_fixed });
+    if !measured.is_empty() {
+        let Measurements { params, positions, seed } = &measured;
+        job_params["measured"] = json!([params, positions, seed]);
+    }
     let params = params.clone();
-    let work = move |inputs: &Inputs<'_, '_>| run_alignment(inputs, &params, &camera_fixed, &sources);
+    let work =
+        move |inputs: &Inputs<'_, '_>| run_alignment(inputs, &params, &camera_fixed, &measured, &sources);
     let aligned = graph.add(Job {
         kind: "aligned",
         version: stages::ALIGNMENT_VERSION,
@@ -59,6 +65,7 @@ fn run_alignment(
     inputs: &Inputs<'_, '_>,
     params: &AlignmentParams,
     camera_fixed: &[bool],
+    measured: &Measurements,
     sources: &[(PathBuf, ContentHash)],
 ) -> Result<Product> {
     params.patch.validate()?;
@@ -76,7 +83,7 @@ fn run_alignment(
     }
     let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
     let mut waiting = output.waiting_among(&output.open_pairs);
-    for component in &mut output.components {
+    for (component, placed) in output.components.iter_mut().zip(&mut output.report.georegistrations) {
         let wraps: Vec<bool> = component
             .images
             .iter()
@@ -87,9 +94,14 @@ fn run_alignment(
             let (path, hash) = &sources[image_at[image.index()]];
             pyramids.get((path, *hash), wraps[image.index()])
         };
-        let report = align_tracks(params, component, &features, camera_fixed, load)?;
+        let by_image = measured.by_image(component);
+        let positions = placed.is_some().then(|| measured.for_adjustment(&by_image));
+        let report = align_tracks(params, component, &features, camera_fixed, positions, load)?;
         sharpen_lengths(component, load)?;
         let registered = register_by_ground(component, &waiting, &features, load)?;
+        if placed.is_some() {
+            *placed = measured.place(component).or(placed.take());
+        }
         waiting.retain(|pair| ![pair.first, pair.second].iter().any(|image| registered.contains(image)));
         if report.aligned * 5 < report.sought {
             output.report.warnings.push(format!(

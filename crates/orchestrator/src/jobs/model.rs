@@ -10,13 +10,14 @@ use serde_json::{Value, json};
 use setloc_features::{Calibration, Camera, ImageFeatures, Match};
 use setloc_sfm::robust::{RansacParams, estimate_turned_camera};
 use setloc_sfm::{
-    CameraId, GeoregisterParams, Georegistration, ImageId, InputImage, MapperInput, MapperOutput,
-    MapperParams, MapperReport, MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction,
-    TwoViewParams, assess, georegister, reconstruct, verify_pair,
+    CameraId, Georegistration, ImageId, InputImage, MapperInput, MapperOutput, MapperParams,
+    MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction, TwoViewParams, assess,
+    reconstruct, verify_pair,
 };
 
 use super::alignment::add_alignment;
 use super::derived_seed;
+use super::positions::Measurements;
 use crate::artifacts::{PairMatches, TurnedPair, VerifiedPair};
 use crate::config::Config;
 use crate::dataset::SourceImage;
@@ -40,6 +41,8 @@ pub struct ModelJobs {
     pub features: Vec<JobId>,
     /// The job whose result the model is.
     pub model: JobId,
+    /// The positions that place it and that it is adjusted to.
+    pub(super) measured: Measurements,
 }
 
 /// What a model is made of.
@@ -94,17 +97,14 @@ pub fn add_model(
         calibration.is_settled() && camera.as_stitched().is_none()
     };
     let fixed = cameras.calibrations.iter().zip(&cameras.cameras).map(is_fixed).collect();
-    let stage = ModelConfig {
-        mapper,
-        two_view: config.two_view.clone(),
-        quality: config.quality.clone(),
-        georegistration: config.georegistration.clone(),
-    };
-    let positions = positions.to_vec();
+    let stage = ModelConfig { mapper, two_view: config.two_view.clone(), quality: config.quality.clone() };
+    let measured =
+        Measurements { params: config.georegistration.clone(), positions: positions.to_vec(), seed };
+    let of_model = measured.clone();
     let pair_list: Vec<(usize, usize, bool)> =
         pairs.iter().map(|&(a, b, _)| (a, b, is_swapped(images, a, b))).collect();
     let work = move |inputs: &Inputs<'_, '_>| {
-        let input = ModelInput { cameras: &cameras, positions: &positions, pairs: &pair_list };
+        let input = ModelInput { cameras: &cameras, measured: &of_model, pairs: &pair_list };
         run_model(inputs, &stage, &input, seed)
     };
     let model = graph.add(Job {
@@ -124,11 +124,11 @@ pub fn add_model(
         graph.accept(model, matches_role(a, b), used.matches);
     }
     let model = if config.alignment.enabled {
-        add_alignment(graph, images, &features, model, fixed, &config.alignment)
+        add_alignment(graph, images, (&features, model), fixed, &config.alignment, measured.clone())
     } else {
         model
     };
-    Ok(ModelJobs { features, model })
+    Ok(ModelJobs { features, model, measured })
 }
 
 /// Adds decoding and extraction of each image.
@@ -376,12 +376,11 @@ struct ModelConfig {
     mapper: MapperParams,
     two_view: TwoViewParams,
     quality: QualityParams,
-    georegistration: GeoregisterParams,
 }
 
 struct ModelInput<'a> {
     cameras: &'a SharedCameras,
-    positions: &'a [Option<MeasuredPosition>],
+    measured: &'a Measurements,
     pairs: &'a [(usize, usize, bool)],
 }
 
@@ -391,10 +390,11 @@ fn run_model(
     input: &ModelInput<'_>,
     seed: u64,
 ) -> Result<Product> {
-    let ModelConfig { mapper: params, two_view, quality, georegistration } = config;
+    let ModelConfig { mapper: params, two_view, quality } = config;
+    let positions = &input.measured.positions;
     let mut features: Vec<(usize, Arc<ImageFeatures>)> = Vec::new();
     let mut id_of = BTreeMap::new();
-    for at in 0..input.positions.len() {
+    for at in 0..positions.len() {
         if let Some(found) = inputs.find::<ImageFeatures>(&features_role(at))? {
             id_of.insert(at, ImageId(features.len() as u32));
             features.push((at, found));
@@ -417,13 +417,11 @@ fn run_model(
     }
     let names: Vec<String> = features.iter().map(|(at, _)| place_holder(*at)).collect();
     let images = features.iter().zip(&names).map(|((at, features), name)| InputImage {
-        position_prior: input.positions[*at].map(|measured| measured.enu),
+        position_prior: positions[*at].map(|measured| measured.enu),
         ..InputImage::new(name, CameraId(input.cameras.of_image[*at] as u32), features)
     });
     let images = images.collect();
     let (cameras, calibrations) = (input.cameras.cameras.clone(), input.cameras.calibrations.clone());
-    let positions: Vec<Option<MeasuredPosition>> =
-        features.iter().map(|(at, _)| input.positions[*at]).collect();
     let input_of_mapper = MapperInput {
         cameras,
         calibrations,
@@ -444,7 +442,7 @@ fn run_model(
         let report = assess(quality, component, &pairs);
         output.report.warnings.extend(report.sentences(component));
         output.outvoted.push(report.outvoted);
-        place(&mut output.report, georegistration, component, &positions, seed);
+        output.report.georegistrations.push(input.measured.place(component));
         output.report.warnings.extend(apart(at, component, &output.report.georegistrations));
     }
     Product::new(output)
@@ -467,55 +465,6 @@ fn apart(
     (at > 0)
         .then(|| format!("component {} is apart from the largest, {frame}: {}", at + 1, images.join(", ")))
 }
-
-/// Moves a component into the measured frame, when positions were given and fix it.
-fn place(
-    report: &mut MapperReport,
-    params: &GeoregisterParams,
-    component: &mut Reconstruction,
-    positions: &[Option<MeasuredPosition>],
-    seed: u64,
-) {
-    if positions.iter().flatten().next().is_none() {
-        report.georegistrations.push(None);
-        return;
-    }
-    let upright: Vec<bool> =
-        component.images.iter().map(|image| component.cameras[image.camera.index()].is_panoramic()).collect();
-    let Some(placed) = georegister(params, component, positions, &upright, seed) else {
-        report.georegistrations.push(None);
-        report.warnings.push(
-            "the measured positions do not fix where the model lies: it keeps its own frame".to_owned(),
-        );
-        return;
-    };
-    component.transform(&placed.enu_from_world);
-    let name = |image: ImageId| component.images[image.index()].name.as_str();
-    let apart = placed.residuals.iter().filter(|(.., agrees)| !agrees);
-    let apart: Vec<(&str, f64)> = apart.map(|&(image, distance, _)| (name(image), distance)).collect();
-    report.warnings.extend(contradicted_positions(&apart, placed.residuals.len()));
-    report.georegistrations.push(Some(placed));
-}
-
-/// Says which of `count` measured positions disagree with a model, by how many metres; where many do, that it may be the
-/// model that is wrong.
-fn contradicted_positions(apart: &[(&str, f64)], count: usize) -> Vec<String> {
-    if apart.len() < MANY_APART || 4 * apart.len() < count {
-        let unused = |(name, metres): &(&str, f64)| {
-            format!("the measured position of {name} is {metres:.1} m off and was not used")
-        };
-        return apart.iter().map(unused).collect();
-    }
-    let each: Vec<String> = apart.iter().map(|(name, metres)| format!("{name} ({metres:.1} m)")).collect();
-    vec![format!(
-        "{} of {count} measured positions contradict the model and were not used: it is folded, as where buildings repeat, or they are wrong: {}",
-        apart.len(),
-        each.join(", ")
-    )]
-}
-
-/// Contradicting positions, a quarter of all at least, that cast doubt on a model.
-const MANY_APART: usize = 3;
 
 /// Stands for an image's name inside models, so that a renamed image leaves them as they are.
 fn place_holder(at: usize) -> String {
@@ -547,20 +496,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn many_positions_that_contradict_a_model_cast_doubt_on_it() {
-        let apart = [("a", 12.0), ("b", 16.06), ("c", 8.0)];
-        let few = contradicted_positions(&apart[..2], 4);
-        assert_eq!(few.len(), 2);
-        assert_eq!(few[1], "the measured position of b is 16.1 m off and was not used");
-        assert_eq!(contradicted_positions(&apart, 13).len(), 3);
-        let many = contradicted_positions(&apart, 12);
-        assert_eq!(many.len(), 1);
-        assert!(many[0].starts_with("3 of 12 measured positions contradict the model"), "{many:?}");
-        assert!(many[0].ends_with("a (12.0 m), b (16.1 m), c (8.0 m)"), "{many:?}");
-        assert!(contradicted_positions(&[], 5).is_empty());
-    }
-
-    #[test]
     fn photos_that_do_not_share_a_guess_are_told() {
         let image = |name: &str, width: u32| {
             SourceImage::guessed(name, Camera::from_focal_guess(width, 1200, 1920.0))
@@ -574,7 +509,7 @@ mod tests {
             };
             let images = cameras.into_iter().enumerate().map(image).collect();
             let components = vec![Reconstruction { images, ..Reconstruction::default() }];
-            let report = MapperReport { doubtful, ..MapperReport::default() };
+            let report = setloc_sfm::MapperReport { doubtful, ..setloc_sfm::MapperReport::default() };
             MapperOutput { components, report, ..MapperOutput::default() }
         };
         let divided = |cameras, doubtful| divided_guesses(&images, &model(cameras, doubtful));

@@ -1,7 +1,10 @@
 //! What measured positions tell of a component's place, and how well they fix it.
 
 use nalgebra::Vector2;
-use setloc_sfm::{Georegistration, ImageId, MeasuredPosition, Reconstruction};
+use setloc_sfm::{
+    GeoregisterParams, Georegistration, ImageId, MeasuredPosition, MeasuredPositions, Reconstruction,
+    georegister,
+};
 
 use super::model::image_of_place_holder;
 
@@ -10,6 +13,84 @@ const MIN_POSITIONS: usize = 3;
 
 /// Standard deviation of the scale, as a share of it, and of the heading, in radians, from which on they are called poor.
 const POOR: f64 = 0.05;
+
+/// Contradicting positions, a quarter of all at least, that cast doubt on a model.
+const MANY_APART: usize = 3;
+
+/// What was measured of some images' positions.
+#[derive(Debug, Clone)]
+pub(super) struct Measurements {
+    pub params: GeoregisterParams,
+    /// By image, as models' images are numbered by their names' place holders.
+    pub positions: Vec<Option<MeasuredPosition>>,
+    pub seed: u64,
+}
+
+impl Measurements {
+    pub fn is_empty(&self) -> bool {
+        self.positions.iter().all(Option::is_none)
+    }
+
+    /// The positions by a component's own numbers of its images.
+    pub fn by_image(&self, component: &Reconstruction) -> Vec<Option<MeasuredPosition>> {
+        let images = component.images.iter();
+        images.map(|image| *self.positions.get(image_of_place_holder(&image.name)?)?).collect()
+    }
+
+    /// Moves a component into the measured frame, when positions were given and fix it.
+    pub fn place(&self, component: &mut Reconstruction) -> Option<Georegistration> {
+        if self.is_empty() {
+            return None;
+        }
+        let upright: Vec<bool> = component
+            .images
+            .iter()
+            .map(|image| component.cameras[image.camera.index()].is_panoramic())
+            .collect();
+        let measured = self.by_image(component);
+        let placed = georegister(&self.params, component, &measured, &upright, self.seed)?;
+        component.transform(&placed.enu_from_world);
+        Some(placed)
+    }
+
+    /// The positions as part of an adjustment, by what [`Measurements::by_image`] gives.
+    pub fn for_adjustment<'a>(&'a self, by_image: &'a [Option<MeasuredPosition>]) -> MeasuredPositions<'a> {
+        MeasuredPositions { params: &self.params, by_image }
+    }
+
+    /// Says where the positions do not fix a component's place, or contradict it.
+    pub fn warnings(&self, component: &Reconstruction, placed: Option<&Georegistration>) -> Vec<String> {
+        if self.is_empty() {
+            return Vec::new();
+        }
+        let Some(placed) = placed else {
+            return vec![
+                "the measured positions do not fix where the model lies: it keeps its own frame".to_owned(),
+            ];
+        };
+        let name = |image: ImageId| component.images[image.index()].name.as_str();
+        let apart = placed.residuals.iter().filter(|(.., agrees)| !agrees);
+        let apart: Vec<(&str, f64)> = apart.map(|&(image, distance, _)| (name(image), distance)).collect();
+        contradicted_positions(&apart, placed.residuals.len())
+    }
+}
+
+/// Says which of `count` measured positions disagree with a model, by how many metres; where many do, that it may be the
+/// model that is wrong.
+fn contradicted_positions(apart: &[(&str, f64)], count: usize) -> Vec<String> {
+    if apart.len() < MANY_APART || 4 * apart.len() < count {
+        let unused = |(name, metres): &(&str, f64)| {
+            format!("the measured position of {name} is {metres:.1} m off and was not used")
+        };
+        return apart.iter().map(unused).collect();
+    }
+    let each: Vec<String> = apart.iter().map(|(name, metres)| format!("{name} ({metres:.1} m)")).collect();
+    vec![format!(
+        "{} of {count} measured positions contradict the model and were not used: it is folded, as where buildings repeat, or they are wrong: {}",
+        apart.len(),
+        each.join(", ")
+    )]
+}
 
 /// An image of a placed component whose position was measured.
 pub(super) struct Fix {
@@ -81,6 +162,20 @@ mod tests {
     fn row(count: u32, offset_m: f64) -> Vec<Fix> {
         let fix = |at| Fix { center: Vector2::new(2.0 * f64::from(at), 7.0), offset_m, agrees: true };
         (0..count).map(fix).collect()
+    }
+
+    #[test]
+    fn many_positions_that_contradict_a_model_cast_doubt_on_it() {
+        let apart = [("a", 12.0), ("b", 16.06), ("c", 8.0)];
+        let few = contradicted_positions(&apart[..2], 4);
+        assert_eq!(few.len(), 2);
+        assert_eq!(few[1], "the measured position of b is 16.1 m off and was not used");
+        assert_eq!(contradicted_positions(&apart, 13).len(), 3);
+        let many = contradicted_positions(&apart, 12);
+        assert_eq!(many.len(), 1);
+        assert!(many[0].starts_with("3 of 12 measured positions contradict the model"), "{many:?}");
+        assert!(many[0].ends_with("a (12.0 m), b (16.1 m), c (8.0 m)"), "{many:?}");
+        assert!(contradicted_positions(&[], 5).is_empty());
     }
 
     #[test]

@@ -73,8 +73,6 @@ struct OrderedModel {
     images: Vec<SourceImage>,
     /// Where these are in the list of the images given.
     order: Vec<usize>,
-    /// Where they were measured about the origin.
-    positions: Vec<Option<MeasuredPosition>>,
     origin: Option<Wgs84>,
 }
 
@@ -97,7 +95,7 @@ fn add_ordered_model(
     let positions: Vec<Option<MeasuredPosition>> = order.iter().map(|&at| listed[at]).collect();
     let source = ModelSource { images: &images, positions: &positions, pairs: &pairs };
     let jobs = add_model(graph, ModelKind::Scene, "scene", source, config, seed)?;
-    Ok(OrderedModel { jobs, images, order, positions, origin })
+    Ok(OrderedModel { jobs, images, order, origin })
 }
 
 /// Adds all jobs from image files to the model that tells guessed cameras; `alike` are pairs of images that look alike.
@@ -163,8 +161,8 @@ pub fn add_scene(
     config: &Config,
     seed: u64,
 ) -> Result<SceneJobs> {
-    let OrderedModel { jobs, images, order, positions, origin } =
-        add_ordered_model(graph, images, alike, config, seed)?;
+    let OrderedModel { jobs, images, order, origin } = add_ordered_model(graph, images, alike, config, seed)?;
+    let measured = jobs.measured;
     let left_apart = add_left_apart(graph, jobs.model, images.len());
     let index_params = config.index.clone();
     let index_work = move |inputs: &Inputs<'_, '_>| {
@@ -194,10 +192,10 @@ pub fn add_scene(
     }
     let names: Vec<String> = images.iter().map(|image| image.name.clone()).collect();
     let config = config.scene_toml()?;
-    let has_altitudes = positions.iter().flatten().any(|position| position.has_height);
+    let has_altitudes = measured.positions.iter().flatten().any(|position| position.has_height);
     let mut params = json!({ "names": names, "origin": origin, "config": config });
     if origin.is_some() {
-        params["positions"] = json!(positions);
+        params["positions"] = json!([measured.positions, measured.params]);
     }
     let scene_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
@@ -222,7 +220,11 @@ pub fn add_scene(
         let georegistrations = || output.report.georegistrations.iter().map(Option::is_some);
         let origin = origin.filter(|_| georegistrations().next() == Some(true));
         let origin = origin.map(|at| if has_altitudes { at } else { Wgs84 { alt: NO_ALTITUDE, ..at } });
-        let fixes = fixes_of(&output, &positions);
+        let fixes = fixes_of(&output, &measured.positions);
+        let contradicted: Vec<String> = (output.components.iter())
+            .zip(&output.report.georegistrations)
+            .flat_map(|(component, placed)| measured.warnings(component, placed.as_ref()))
+            .collect();
         let listed = names.len();
         let relative = origin.filter(|origin| !has_altitude(*origin)).map(|_| {
             "the measured positions have no altitudes: heights are relative, and left out where WGS84 is told".to_owned()
@@ -235,7 +237,14 @@ pub fn add_scene(
             .zip(&doubtful)
             .filter_map(|(component, images)| doubt(component, images))
             .collect();
-        let errors: Vec<Option<ModelErrors>> = output.components.iter().map(ModelErrors::of_model).collect();
+        let errors: Vec<Option<ModelErrors>> = (output.components.iter())
+            .zip(&output.report.georegistrations)
+            .map(|(component, placed)| {
+                let by_image = measured.by_image(component);
+                let positions = placed.as_ref().map(|_| measured.for_adjustment(&by_image));
+                ModelErrors::of_model(component, positions)
+            })
+            .collect();
         let is_placed = georegistrations().next() == Some(true) && origin.is_some();
         let unit = if is_placed { " m" } else { "" };
         let accuracies: Vec<Option<Accuracy>> = (output.components.iter().zip(&errors))
@@ -258,7 +267,8 @@ pub fn add_scene(
             placed: georegistrations().map(|is_placed| is_placed && origin.is_some()).collect(),
             features,
             origin,
-            warnings: (output.report.warnings.iter().map(|text| with_names(text, &names)))
+            warnings: (output.report.warnings.iter().chain(&contradicted))
+                .map(|text| with_names(text, &names))
                 .chain(doubts)
                 .chain(weak)
                 .chain(recall.as_ref().filter(|recall| recall.share < MIN_RECALL).map(Recall::warning))

@@ -79,10 +79,17 @@ pub struct PositionPrior {
     pub pose: u32,
     /// Measured centre in the world frame.
     pub position: Vector3<f64>,
-    /// Standard deviation of each coordinate, in the world's unit of length.
-    pub sigma: f64,
+    /// Standard deviation of each coordinate, in the world's unit of length; infinite where nothing was measured.
+    pub sigma: Vector3<f64>,
     /// Loss on the whitened distance.
     pub loss: RobustLoss,
+}
+
+impl PositionPrior {
+    /// An offset from the measured centre, squared in standard deviations.
+    pub(super) fn squared(&self, offset: &Vector3<f64>) -> f64 {
+        offset.component_div(&self.sigma).norm_squared()
+    }
 }
 
 /// A value and its standard deviation.

@@ -6,7 +6,7 @@ use super::camera_system::Budget;
 use super::normal_equations::{Model, NormalEquations};
 use super::residual::angular_squared;
 use super::spherical::{Layout, POSE_DIM, Spherical, bearing_and_weight};
-use super::{BundleObservation, BundleProblem, RobustLoss, store};
+use super::{BundleObservation, BundleProblem, PositionPrior, RobustLoss, store};
 
 /// Damping of the step, and what is tried where that is too little for the system to be definite in spite of rounding: the first is
 /// enough to keep a free gauge where it is, and too little for what bends a long chain to notice.
@@ -31,7 +31,47 @@ impl BundleProblem {
                 seen.sigma /= loss.mean_curvature(squared).sqrt();
             }
         }
+        for prior in &mut weighted.position_priors {
+            if let Some(squared) = self.position_offset(prior).map(|offset| prior.squared(&offset)) {
+                prior.sigma /= prior.loss.mean_curvature(squared).sqrt();
+                prior.loss = RobustLoss::Trivial;
+            }
+        }
         weighted
+    }
+
+    /// The variance of the observations over what they state: that of what the loss makes of the residuals, with what the points
+    /// took up of them, by its curvature.
+    ///
+    /// The loss' scale and their own both cancel: twice the stated noise is a quarter.
+    pub fn variance_factor(&self, loss: RobustLoss) -> f64 {
+        let (mut pulls, mut curvature, mut count) = (0.0, 0.0, 0_usize);
+        let mut is_seen = vec![false; self.points.len()];
+        for seen in &self.observations {
+            let Some(Sight { squared, .. }) = self.sight(seen) else { continue };
+            pulls += loss.evaluate(squared).1.powi(2) * squared;
+            curvature += loss.mean_curvature(squared);
+            count += 1;
+            is_seen[seen.point as usize] = true;
+        }
+        let unknowns = 3 * is_seen.iter().filter(|is_seen| **is_seen).count();
+        let freedom = (2 * count).saturating_sub(unknowns).max(1) as f64;
+        (pulls / freedom) / (curvature / count.max(1) as f64)
+    }
+
+    /// What the measured positions are off, each by its own loss, as errors that move the minimum of the problem
+    /// [`BundleProblem::reweighted`] as [`BundleProblem::residuals_under`] do.
+    pub fn position_residuals(&self) -> Vec<Vector3<f64>> {
+        let residual = |prior: &PositionPrior| {
+            let offset = self.position_offset(prior)?;
+            Some(offset * pull(prior.loss, prior.squared(&offset)))
+        };
+        self.position_priors.iter().map(|prior| residual(prior).unwrap_or_default()).collect()
+    }
+
+    /// From a pose's centre to where it was measured.
+    fn position_offset(&self, prior: &PositionPrior) -> Option<Vector3<f64>> {
+        Some(prior.position - self.poses.get(prior.pose as usize)?.world_from_camera.translation)
     }
 
     /// What the observations are off, as errors of their bearings (camera frames, across, in radians) that move the minimum of the
@@ -41,8 +81,7 @@ impl BundleProblem {
     pub fn residuals_under(&self, loss: RobustLoss) -> Vec<Vector3<f64>> {
         let residual = |seen: &BundleObservation| {
             let Sight { bearing, expected, squared } = self.sight(seen)?;
-            let pull = loss.evaluate(squared).1 / loss.mean_curvature(squared);
-            Some((bearing - expected.try_normalize(f64::MIN_POSITIVE)?) * pull.min(MAX_PULL))
+            Some((bearing - expected.try_normalize(f64::MIN_POSITIVE)?) * pull(loss, squared))
         };
         self.observations.iter().map(|seen| residual(seen).unwrap_or_default()).collect()
     }
@@ -61,6 +100,11 @@ impl BundleProblem {
         let point = self.points.get(point as usize)?.position;
         Some(self.poses.get(pose as usize)?.world_from_camera.inverse().transform_point(&point))
     }
+}
+
+/// The factor that makes a residual an error to a quadratic cost of the loss' own curvature.
+fn pull(loss: RobustLoss, squared: f64) -> f64 {
+    (loss.evaluate(squared).1 / loss.mean_curvature(squared)).min(MAX_PULL)
 }
 
 /// What an observation shows beside what it ought to, in the camera's frame.

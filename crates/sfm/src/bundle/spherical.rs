@@ -85,7 +85,7 @@ impl PixelRay {
 struct Prior {
     pose: u32,
     position: Vector3<f64>,
-    inverse_sigma: f64,
+    inverse_sigma: Vector3<f64>,
     loss: RobustLoss,
 }
 
@@ -210,7 +210,8 @@ pub(super) struct Layout {
 impl Prior {
     /// (t − p)/σ.
     fn residual(&self, poses: &[PoseState]) -> Vector3<f64> {
-        (poses[self.pose as usize].world_from_camera.translation - self.position) * self.inverse_sigma
+        let offset = poses[self.pose as usize].world_from_camera.translation - self.position;
+        offset.component_mul(&self.inverse_sigma)
     }
 }
 
@@ -299,8 +300,7 @@ impl Spherical {
             let pose = prior.pose as usize;
             let valid = pose_usable.get(pose) == Some(&true)
                 && (prior.position.x + prior.position.y + prior.position.z).is_finite()
-                && prior.sigma.is_finite()
-                && prior.sigma > 0.0
+                && prior.sigma.iter().all(|sigma| *sigma > 0.0)
                 && prior.loss.is_valid();
             if !valid {
                 ignored += 1;
@@ -309,7 +309,7 @@ impl Spherical {
                 priors.push(Prior {
                     pose: prior.pose,
                     position: prior.position,
-                    inverse_sigma: 1.0 / prior.sigma,
+                    inverse_sigma: prior.sigma.map(f64::recip),
                     loss: prior.loss,
                 });
             }
@@ -492,8 +492,8 @@ impl Model<POSE_DIM> for Spherical {
             cost += 0.5 * rho;
             let (mut hessian, mut gradient) = ([[0.0; 6]; 6], [0.0; 6]);
             for k in 0..3 {
-                hessian[3 + k][3 + k] = weight * prior.inverse_sigma * prior.inverse_sigma;
-                gradient[3 + k] = weight * prior.inverse_sigma * r[k];
+                hessian[3 + k][3 + k] = weight * prior.inverse_sigma[k].powi(2);
+                gradient[3 + k] = weight * prior.inverse_sigma[k] * r[k];
             }
             add(self.block_of_pose[prior.pose as usize] as usize, &hessian, &gradient);
         }

@@ -315,7 +315,12 @@ fn position_priors_set_scale_and_place() {
     for (pose, of_truth) in truth.poses.iter().enumerate() {
         let position = of_truth.world_from_camera.translation;
         let loss = RobustLoss::Cauchy(3.0);
-        problem.position_priors.push(PositionPrior { pose: pose as u32, position, sigma: 0.5, loss });
+        problem.position_priors.push(PositionPrior {
+            pose: pose as u32,
+            position,
+            sigma: Vector3::repeat(0.5),
+            loss,
+        });
     }
     perturb(&mut problem, 0.05, 19);
     solve(&tight(), &mut problem);
@@ -397,7 +402,12 @@ fn conjugate_gradients_reach_the_optimum_of_cholesky() {
     for (pose, of_pose) in start.poses.iter().enumerate() {
         let position = of_pose.world_from_camera.translation + Vector3::new(0.01, -0.02, 0.005);
         let loss = RobustLoss::Cauchy(3.0);
-        start.position_priors.push(PositionPrior { pose: pose as u32, position, sigma: 0.1, loss });
+        start.position_priors.push(PositionPrior {
+            pose: pose as u32,
+            position,
+            sigma: Vector3::repeat(0.1),
+            loss,
+        });
     }
     start.poses[3].fixed = true;
     start.points.iter_mut().step_by(11).for_each(|point| point.fixed = true);
@@ -467,7 +477,7 @@ fn streets(count: usize, each: usize, landmarks: usize, seed: u64) -> BundleProb
         problem.poses.push(BundlePose { camera: 0, world_from_camera, fixed: index < 2 });
         let position = centre + Vector3::from_fn(|_, _| normal(&mut rng)) * 0.1;
         let (pose, loss) = (index as u32, RobustLoss::Trivial);
-        problem.position_priors.push(PositionPrior { pose, position, sigma: 0.1, loss });
+        problem.position_priors.push(PositionPrior { pose, position, sigma: Vector3::repeat(0.1), loss });
     }
     let mut see = |problem: &mut BundleProblem,
                    position: Vector3<f64>,
