@@ -94,18 +94,18 @@ pub(super) fn project_with_jacobian(params: &[f64], direction: &Vector3<f64>) ->
     Some(ProjectJacobian { pixel, d_direction, d_params })
 }
 
+/// In its caller, which leaves out what it has no use for.
+#[inline(always)]
 pub(super) fn unproject_with_jacobian(params: &[f64], pixel: &Vector2<f64>) -> Option<UnprojectJacobian> {
     let sphere = Sphere::new(params);
     let (longitude, latitude) = sphere.angles(pixel)?;
-    let bearing = bearing(longitude, latitude);
+    let ((sin_p, cos_p), (sin_t, cos_t)) = (longitude.sin_cos(), latitude.sin_cos());
+    let bearing = Vector3::new(cos_t * sin_p, sin_t, cos_t * cos_p);
     if !bearing.iter().all(|value| value.is_finite()) {
         return None;
     }
-    let (sin_latitude, _) = latitude.sin_cos();
-    let (sin_longitude, cos_longitude) = longitude.sin_cos();
     let d_longitude = Vector3::new(bearing.z, 0.0, -bearing.x);
-    let d_latitude =
-        Vector3::new(-sin_latitude * sin_longitude, latitude.cos(), -sin_latitude * cos_longitude);
+    let d_latitude = Vector3::new(-sin_t * sin_p, cos_t, -sin_t * cos_p);
     let d_u = d_longitude * (TAU / sphere.width);
     let d_v = d_latitude * (PI / sphere.height);
     let mut d_params = SMatrix::<f64, 3, MAX_CAMERA_PARAMS>::zeros();

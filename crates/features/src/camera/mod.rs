@@ -316,8 +316,8 @@ impl Camera {
         if !self.is_stretched() {
             return self.unproject(pixel).zip(self.pixel_angle(pixel));
         }
-        let ray = self.unproject_plain(&self.plain_ray(pixel)?);
-        Some((ray.bearing, ray.pixel_angle()))
+        let (bearing, d_pixel) = stitched::ray(&self.params, pixel)?;
+        Some((bearing, pixel_angle(&d_pixel)))
     }
 
     /// The angle in radians that one pixel spans at this place of the image.

@@ -68,9 +68,16 @@ pub(super) fn unproject_with_jacobian(params: &[f64], pixel: &Vector2<f64>) -> O
     Some(ray)
 }
 
+#[inline(always)]
 pub(super) fn plain_ray(params: &[f64], pixel: &Vector2<f64>) -> Option<PlainRay> {
     let ray = equirectangular::unproject_with_jacobian(&params[..OF_SPHERE], pixel)?;
     Some(PlainRay { bearing: ray.bearing, d_pixel: ray.d_pixel })
+}
+
+/// The ray of a pixel and how it moves with it.
+pub(super) fn ray(params: &[f64], pixel: &Vector2<f64>) -> Option<(Vector3<f64>, Matrix3x2<f64>)> {
+    let ray = stretched(params, &plain_ray(params, pixel)?).0;
+    Some((ray.bearing, ray.d_pixel))
 }
 
 /// The ray for a plain one, without its derivatives by the parameters of the sphere.
@@ -78,7 +85,8 @@ pub(super) fn of_plain(params: &[f64], plain: &PlainRay) -> UnprojectJacobian {
     stretched(params, plain).0
 }
 
-/// And ∂ray/∂(plain ray).
+/// And ∂ray/∂(plain ray). In its caller, which leaves out what it has no use for.
+#[inline(always)]
 fn stretched(params: &[f64], plain: &PlainRay) -> (UnprojectJacobian, Matrix3<f64>) {
     let stretch = stretch(params);
     let stretched = stretch * plain.bearing;

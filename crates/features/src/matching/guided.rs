@@ -1,4 +1,4 @@
-use std::f64::consts::{FRAC_PI_2, PI};
+use std::f64::consts::PI;
 use std::ops::Range;
 
 use nalgebra::{Matrix3, Vector3};
@@ -238,6 +238,16 @@ vectorized! {
     }
 }
 
+/// Grows with the azimuth of a direction, from 0 to 1 over half a turn, and the same for the opposite one: a function of it that takes
+/// two divisions' time, with which sectors differ in width by a factor of two.
+fn part_of_half_turn(x: f64, y: f64) -> f64 {
+    let x = if y < 0.0 { -x } else { x };
+    0.5 - 0.5 * x / (x.abs() + y.abs()).max(f64::MIN_POSITIVE)
+}
+
+/// Most that [`part_of_half_turn`] grows by, a radian.
+const STEEPEST_PART: f64 = 0.5;
+
 /// Some of the second image's keypoints by azimuth about its epipole: every epipolar plane contains the epipole, so the
 /// keypoints near one plane are those of nearly one azimuth (modulo π, a plane has two sides).
 struct Sectors {
@@ -278,24 +288,25 @@ impl Sectors {
         let span = |keypoint: &u32| {
             let bearing = &bearings[*keypoint as usize];
             let (x, y) = (bearing.dot(&x_axis), bearing.dot(&y_axis));
-            // sin(deviation) = sin(angle to the epipole) · sin(azimuth difference).
-            let sine = max_sine / x.hypot(y);
-            // A little wider, so that rounding never hides a candidate that the exact test accepts.
-            let half = if sine < 1.0 { sine.asin() + 1e-9 } else { FRAC_PI_2 };
-            if half >= FRAC_PI_2 {
+            // sin(deviation) = sin(angle to the epipole) · sin(azimuth difference), and the tangent of the latter is above it. A
+            // little wider, so that rounding never hides a candidate that the exact test accepts.
+            let rest = x * x + y * y - max_sine * max_sine;
+            let half = STEEPEST_PART * (max_sine / rest.max(0.0).sqrt() + 1e-9);
+            // Also where it is infinite.
+            if !(half < 0.5) {
                 return (0, count);
             }
-            let azimuth = y.atan2(x).rem_euclid(PI);
-            let width = PI / count as f64;
-            let begin = ((azimuth - half) / width).floor();
-            let end = ((azimuth + half) / width).floor();
-            let len = ((end - begin) as usize + 1).min(count);
-            (begin.rem_euclid(count as f64) as usize % count, len)
+            let part = part_of_half_turn(x, y) + 1.0;
+            let begin = ((part - half) * count as f64) as usize;
+            let end = ((part + half) * count as f64) as usize;
+            (begin % count, (end - begin + 1).min(count))
         };
         let spans: Vec<(usize, usize)> = keypoints.iter().map(span).collect();
+        // A span may go past the last sector once.
+        let wrapped = |sector: usize| if sector < count { sector } else { sector - count };
         let mut starts = vec![0; count + 1];
         for &(begin, len) in &spans {
-            (0..len).for_each(|step| starts[(begin + step) % count + 1] += 1);
+            (begin..begin + len).for_each(|sector| starts[wrapped(sector) + 1] += 1);
         }
         for sector in 0..count {
             starts[sector + 1] += starts[sector];
@@ -303,8 +314,7 @@ impl Sectors {
         let mut next = starts.clone();
         let mut members = vec![0; starts[count]];
         for (&keypoint, &(begin, len)) in keypoints.iter().zip(&spans) {
-            for step in 0..len {
-                let sector = (begin + step) % count;
+            for sector in (begin..begin + len).map(wrapped) {
                 members[next[sector]] = keypoint;
                 next[sector] += 1;
             }
@@ -317,9 +327,9 @@ impl Sectors {
     /// Keypoints that may lie in the band of the plane with this normal, in index order, and their bearings.
     fn candidates(&self, plane: &Vector3<f64>) -> (&[u32], [&[f64]; 3]) {
         // The plane's azimuth is a quarter turn from its normal's.
-        let azimuth = plane.dot(&self.x_axis).atan2(-plane.dot(&self.y_axis)).rem_euclid(PI);
+        let part = part_of_half_turn(-plane.dot(&self.y_axis), plane.dot(&self.x_axis));
         let count = self.starts.len() - 1;
-        let sector = ((azimuth / PI * count as f64) as usize).min(count - 1);
+        let sector = ((part * count as f64) as usize).min(count - 1);
         let range = self.starts[sector]..self.starts[sector + 1];
         (&self.members[range.clone()], [0, 1, 2].map(|axis: usize| &self.bearings[axis][range.clone()]))
     }
