@@ -144,6 +144,32 @@ pub fn extract(
     camera: &Camera,
     mask: Option<&Mask>,
 ) -> Result<ImageFeatures, FeatureError> {
+    extract_beside(params, image, camera, mask, None)
+}
+
+/// What [`extract`] finds in an image in which it found `own` without simulated views: with the same parameters, but with a
+/// [`simulated_tilt`](FeatureParams::simulated_tilt) of 1.
+///
+/// # Errors
+/// Those of [`extract`].
+pub fn extract_simulated_views(
+    params: &FeatureParams,
+    image: &DecodedImage,
+    camera: &Camera,
+    mask: Option<&Mask>,
+    own: &ImageFeatures,
+) -> Result<ImageFeatures, FeatureError> {
+    extract_beside(params, image, camera, mask, Some(own))
+}
+
+/// [`extract`], with what it finds without simulated views but those of faint images, where that is known.
+fn extract_beside(
+    params: &FeatureParams,
+    image: &DecodedImage,
+    camera: &Camera,
+    mask: Option<&Mask>,
+    known: Option<&ImageFeatures>,
+) -> Result<ImageFeatures, FeatureError> {
     params.validate()?;
     camera.validate()?;
     let (width, height) = (image.width, image.height);
@@ -173,11 +199,23 @@ pub fn extract(
         pixel: reduction.recip() as f32,
     };
     let mut features = ImageFeatures { width, height, ..ImageFeatures::default() };
-    let view = View { grey: &grey, enlargement, tilt: [1.0; 2] };
-    let (light, usual) = source.append_view(&view, params.max_features, &mut features);
-    features.light = light;
-    let is_faint = usual < params.min_features.min(params.max_features);
+    let is_faint;
+    if let Some(own) = known {
+        is_faint = !own.simulated.is_empty();
+        features = own.without_simulated_views();
+    } else {
+        let view = View { grey: &grey, enlargement, tilt: [1.0; 2] };
+        let (light, usual) = source.append_view(&view, params.max_features, &mut features);
+        features.light = light;
+        is_faint = usual < params.min_features.min(params.max_features);
+    }
     let tilt = if is_faint { params.simulated_tilt.max(params.faint_tilt) } else { params.simulated_tilt };
+    if let Some(own) = known
+        && is_faint
+        && tilt <= params.faint_tilt
+    {
+        return Ok(own.clone());
+    }
     if tilt > 1.0 {
         for tilt in [[tilt, 1.0], [1.0, tilt]] {
             let pixels = enlargement.powi(2) * grey.values.len() as f64 / (tilt[0] * tilt[1]);
@@ -517,6 +555,25 @@ mod tests {
         let of_min = |min_features| views(FeatureParams { min_features, ..FeatureParams::default() });
         assert_eq!([of_min(0), of_min(4), of_min(4096)], [0, 0, 2]);
         assert_eq!(views(FeatureParams { faint_tilt: 1.0, ..FeatureParams::default() }), 0);
+    }
+
+    #[test]
+    fn views_are_the_same_where_the_image_itself_is_known() {
+        let image = blobs(240, 200, &[[60.5, 70.5], [130.3, 60.8], [90.75, 140.25], [170.0, 150.0]]);
+        // Neither of two images without views is faint, and one that is has views already.
+        for (min_features, simulated_tilt, faint_tilt) in
+            [(0, 1.5, 2.0), (4096, 1.5, 1.0), (4096, 1.5, 2.0), (4096, 3.0, 2.0)]
+        {
+            let params =
+                FeatureParams { min_features, simulated_tilt, faint_tilt, ..FeatureParams::default() };
+            let camera = photo(240, 200);
+            let own =
+                extract(&FeatureParams { simulated_tilt: 1.0, ..params.clone() }, &image, &camera, None)
+                    .unwrap();
+            let whole = extract(&params, &image, &camera, None).unwrap();
+            assert!(!whole.simulated.is_empty());
+            assert_eq!(extract_simulated_views(&params, &image, &camera, None, &own).unwrap(), whole);
+        }
     }
 
     #[test]

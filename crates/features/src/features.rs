@@ -120,6 +120,18 @@ impl ImageFeatures {
         })
     }
 
+    /// The image's own features alone.
+    #[must_use]
+    pub fn without_simulated_views(&self) -> Self {
+        let own = self.own_len();
+        let mut features = self.clone();
+        features.simulated.clear();
+        features.keypoints.truncate(own);
+        features.descriptors.truncate(own * DESCRIPTOR_LEN);
+        features.colors.truncate(own);
+        features
+    }
+
     /// The descriptors of some keypoints.
     pub(crate) fn descriptors_of(&self, indices: &Range<usize>) -> &[u8] {
         &self.descriptors[indices.start * DESCRIPTOR_LEN..indices.end * DESCRIPTOR_LEN]

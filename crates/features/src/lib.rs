@@ -67,14 +67,15 @@ pub use decode::{
     decode_grey, fallback_camera, guess_camera, probe,
 };
 pub use error::FeatureError;
-pub use extract::{FeatureParams, extract, keypoint_noise_px};
+pub use extract::{FeatureParams, extract, extract_simulated_views, keypoint_noise_px};
 pub use features::{DESCRIPTOR_LEN, DESCRIPTOR_NORM, ImageFeatures, Keypoint, Rays, SimulatedView};
 pub use geodesy::Wgs84;
 pub use grey::GreyImage;
 pub use mask::Mask;
 pub use matching::{
     DescriptorBlock, Elevations, GuidedParams, Match, MatchParams, Posture, TwoNearest, match_features,
-    match_guided, match_guided_among, squared_distance, squared_norm, two_nearest, without_carried,
+    match_guided, match_guided_among, match_simulated_views, squared_distance, squared_norm, two_nearest,
+    without_carried,
 };
 pub use nearby::NearbyKeypoints;
 pub use patch::{Aligned, ImagePyramid, Patch, PatchFrame, PatchParams, Template};

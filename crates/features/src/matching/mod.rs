@@ -195,6 +195,28 @@ pub fn match_features(
     first: &ImageFeatures,
     second: &ImageFeatures,
 ) -> Vec<Match> {
+    match_beside(params, posture, first, second, None)
+}
+
+/// What [`match_features`] finds of two images of which it found `own` without their simulated views.
+pub fn match_simulated_views(
+    params: &MatchParams,
+    posture: Posture,
+    first: &ImageFeatures,
+    second: &ImageFeatures,
+    own: &[Match],
+) -> Vec<Match> {
+    match_beside(params, posture, first, second, Some(own))
+}
+
+/// [`match_features`], with what the images' own keypoints match where that is known.
+fn match_beside(
+    params: &MatchParams,
+    posture: Posture,
+    first: &ImageFeatures,
+    second: &ImageFeatures,
+    known: Option<&[Match]>,
+) -> Vec<Match> {
     let worth_screening = |features: &ImageFeatures| features.own_len() >= 8 * params.screen_features;
     let mut strongest = None;
     if params.screen_features > 0 && worth_screening(first) && worth_screening(second) {
@@ -213,7 +235,8 @@ pub fn match_features(
         }
         None => match_all(params, (first, a), (second, b)),
     };
-    let own = without_carried(of_parts(first.parts(), second.parts()), posture, first, second);
+    let own = || without_carried(of_parts(first.parts(), second.parts()), posture, first, second);
+    let own = known.map_or_else(own, <[Match]>::to_vec);
     if own.len() >= params.simulate_below || (first.simulated.is_empty() && second.simulated.is_empty()) {
         return own;
     }
@@ -561,8 +584,13 @@ mod tests {
             }
             features
         };
-        let found = match_features(&params, Posture::Any, &viewed(&weak, &strong), &viewed(&strong, &weak));
+        let (first, second) = (viewed(&weak, &strong), viewed(&strong, &weak));
+        let found = match_features(&params, Posture::Any, &first, &second);
         assert_eq!(found.len(), 100);
+        // What the images' own keypoints match need not be found again.
+        let alone = [&first, &second].map(ImageFeatures::without_simulated_views);
+        let own = match_features(&params, Posture::Any, &alone[0], &alone[1]);
+        assert_eq!(match_simulated_views(&params, Posture::Any, &first, &second, &own), found);
     }
 
     #[test]

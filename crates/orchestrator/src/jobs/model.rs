@@ -69,18 +69,15 @@ pub fn add_model(
     seed: u64,
 ) -> Result<ModelJobs> {
     let ModelSource { images, positions, pairs: chosen } = source;
-    let features = match kind {
-        ModelKind::Scene => {
-            let (first, second) = (config.features.clone(), config.second_features());
-            let params = |image: &SourceImage| if image.second_look { &second } else { &first };
-            images.iter().map(|image| add_features(graph, image, params(image))).collect()
-        }
-        ModelKind::Local => add_features_of(graph, images, &config.photo_features()),
+    let looks = match kind {
+        ModelKind::Scene => Looks::add(graph, images, config),
+        ModelKind::Local => Looks::once(add_features_of(graph, images, &config.photo_features())),
     };
     let mut pairs = Vec::new();
     for &(a, b) in chosen {
-        pairs.push((a, b, add_pair(graph, images, &features, (a, b), config, seed)));
+        pairs.push((a, b, add_pair(graph, images, &looks, (a, b), config, seed)));
     }
+    let features = looks.last;
     let cameras = share_cameras(images);
     let placed: Vec<_> =
         cameras.of_image.iter().zip(positions).map(|(camera, position)| json!([camera, position])).collect();
@@ -131,13 +128,43 @@ pub fn add_model(
     Ok(ModelJobs { features, model, measured })
 }
 
+/// The features jobs of some images.
+struct Looks {
+    /// Without the views that a second look simulates.
+    first: Vec<JobId>,
+    /// With them, where there is one; else the same.
+    last: Vec<JobId>,
+}
+
+impl Looks {
+    fn once(features: Vec<JobId>) -> Self {
+        Self { first: features.clone(), last: features }
+    }
+
+    /// Adds decoding and extraction of the images of a scene, and what a second look adds to those that are due one.
+    fn add(graph: &mut JobGraph<'_>, images: &[SourceImage], config: &Config) -> Self {
+        let second = config.second_features();
+        let mut looks = Self::once(add_features_of(graph, images, &config.features));
+        for (image, last) in images.iter().zip(&mut looks.last).filter(|(image, _)| image.second_look) {
+            // Views that the first look has simulated are not those of the second.
+            let beside = (config.features.simulated_tilt <= 1.0).then_some(*last);
+            *last = add_features(graph, image, &second, beside);
+        }
+        looks
+    }
+
+    fn is_again(&self, at: usize) -> bool {
+        self.first[at] != self.last[at]
+    }
+}
+
 /// Adds decoding and extraction of each image.
 pub fn add_features_of(
     graph: &mut JobGraph<'_>,
     images: &[SourceImage],
     params: &stages::FeatureParams,
 ) -> Vec<JobId> {
-    images.iter().map(|image| add_features(graph, image, params)).collect()
+    images.iter().map(|image| add_features(graph, image, params, None)).collect()
 }
 
 pub(super) fn features_role(at: usize) -> String {
@@ -157,7 +184,13 @@ fn is_swapped(images: &[SourceImage], a: usize, b: usize) -> bool {
     images[b].hash < images[a].hash
 }
 
-fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, features: &stages::FeatureParams) -> JobId {
+/// Adds decoding and extraction of an image, `beside` a job that has extracted all but simulated views.
+fn add_features(
+    graph: &mut JobGraph<'_>,
+    image: &SourceImage,
+    features: &stages::FeatureParams,
+    beside: Option<JobId>,
+) -> JobId {
     let mut external = BTreeMap::from([("image".to_owned(), image.hash)]);
     let mask = image.mask.clone();
     if let Some((_, hash)) = &mask {
@@ -171,16 +204,27 @@ fn add_features(graph: &mut JobGraph<'_>, image: &SourceImage, features: &stages
     };
     // Decoded pixels and three layers of the enlarged image with their smaller octaves, two bytes a pixel, and what passes through.
     let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 32;
-    let params = json!({ "features": features, "camera": camera });
+    let mut params = json!({ "features": features, "camera": camera });
+    if beside.is_some() {
+        params["beside"] = json!("own");
+    }
     let (path, hash, features) = (image.path.clone(), image.hash, features.clone());
-    let work = move |_: &Inputs<'_, '_>| {
+    let work = move |inputs: &Inputs<'_, '_>| {
         let bytes = read_unchanged(&path, hash)?;
         let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
         let mask = mask.as_ref().map(|(path, hash)| read_mask(path, *hash)).transpose()?;
-        Product::new(stages::extract(&features, &decoded, &camera, mask.as_ref())?)
+        let mask = mask.as_ref();
+        Product::new(match inputs.find::<ImageFeatures>("own")? {
+            Some(own) => stages::extract_simulated_views(&features, &decoded, &camera, mask, &own)?,
+            None => stages::extract(&features, &decoded, &camera, mask)?,
+        })
     };
     let (kind, version, name) = ("features", stages::FEATURES_VERSION, image.name.clone());
-    graph.add(Job { kind, version, name, params, external, memory, work: Box::new(work) })
+    let job = graph.add(Job { kind, version, name, params, external, memory, work: Box::new(work) });
+    if let Some(own) = beside {
+        graph.require(job, "own", own);
+    }
+    job
 }
 
 fn read_mask(path: &Path, hash: ContentHash) -> Result<stages::Mask> {
@@ -207,12 +251,15 @@ struct PairJobs {
 fn add_pair(
     graph: &mut JobGraph<'_>,
     images: &[SourceImage],
-    features: &[JobId],
+    looks: &Looks,
     (a, b): (usize, usize),
     config: &Config,
     seed: u64,
 ) -> PairJobs {
-    let matches = add_matches(graph, images, features, (a, b), config);
+    let mut matches = add_matches(graph, images, &looks.first, (a, b), config);
+    if looks.is_again(a) || looks.is_again(b) {
+        matches = add_matches_of_views(graph, images, looks, (a, b), matches, config);
+    }
     let (a, b) = in_order(images, (a, b));
     let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
     let seed = pair_seed(images, (a, b), seed);
@@ -227,7 +274,7 @@ fn add_pair(
         Product::new(VerifiedPair(verify_pair(&two_view, posture, &first, &second, &matches.0, seed)))
     };
     let job = pair_job(images, (a, b), ("verify", stages::VERIFY_VERSION), params, work);
-    let verified = add_pair_job(graph, job, features, (a, b));
+    let verified = add_pair_job(graph, job, &looks.last, (a, b));
     graph.require(verified, "matches", matches);
     PairJobs { matches, verified }
 }
@@ -285,6 +332,40 @@ fn add_matches(
     };
     let job = pair_job(images, (a, b), ("matches", stages::MATCHING_VERSION), params, work);
     add_pair_job(graph, job, features, (a, b))
+}
+
+/// Adds to the matches of one pair those of the views that a second look simulates of either.
+fn add_matches_of_views(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    looks: &Looks,
+    pair: (usize, usize),
+    own: JobId,
+    config: &Config,
+) -> JobId {
+    let (a, b) = in_order(images, pair);
+    let matching = config.matching.clone();
+    let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
+    let params = json!({ "matching": config.matching, "posture": posture, "beside": "own" });
+    let work = move |inputs: &Inputs<'_, '_>| {
+        let features = |role: &str| inputs.get::<ImageFeatures>(role);
+        let (first, second) = (features("first")?, features("second")?);
+        let had_views =
+            !features("first alone")?.simulated.is_empty() || !features("second alone")?.simulated.is_empty();
+        Product::new(PairMatches(if had_views {
+            // Those of faint images are among what has been matched.
+            stages::match_features(&matching, posture, &first, &second)
+        } else {
+            let own = inputs.get::<PairMatches>("own")?;
+            stages::match_simulated_views(&matching, posture, &first, &second, &own.0)
+        }))
+    };
+    let job = pair_job(images, (a, b), ("matches", stages::MATCHING_VERSION), params, work);
+    let job = add_pair_job(graph, job, &looks.last, (a, b));
+    graph.require(job, "own", own);
+    graph.require(job, "first alone", looks.first[a]);
+    graph.require(job, "second alone", looks.first[b]);
+    job
 }
 
 /// Pixels of a pair that are compared to tell a focal length by a turn, as shares of the longer side: deviation, and the range of
