@@ -80,13 +80,13 @@ impl Measurements {
 fn contradicted_positions(apart: &[(&str, f64)], count: usize) -> Vec<String> {
     if apart.len() < MANY_APART || 4 * apart.len() < count {
         let unused = |(name, metres): &(&str, f64)| {
-            format!("the measured position of {name} is {metres:.1} m off and was not used")
+            format!("the measured position of {name} is {metres:.1} m off and hardly counts")
         };
         return apart.iter().map(unused).collect();
     }
     let each: Vec<String> = apart.iter().map(|(name, metres)| format!("{name} ({metres:.1} m)")).collect();
     vec![format!(
-        "{} of {count} measured positions contradict the model and were not used: it is folded, as where buildings repeat, or they are wrong: {}",
+        "{} of {count} measured positions contradict the model and hardly count: it is folded, as where buildings repeat, or they are wrong: {}",
         apart.len(),
         each.join(", ")
     )]
@@ -117,39 +117,72 @@ pub(super) fn fixes(
     placed.residuals.iter().filter_map(fix).collect()
 }
 
-/// How many of `listed` images have positions, and how far off these are.
+/// How well some positions fix a frame.
+///
+/// Of positions at distances rᵢ from their middle, each off by σ in either direction, scale and heading have the
+/// deviation σ / √Σrᵢ², and the middle σ / √n: what all are off together is in neither.
+struct Fixed {
+    /// How many agree with each other.
+    count: usize,
+    /// Metres round their middle within which they mostly are.
+    within_m: f64,
+    /// σ, and what follows from it; `None` where no more are than fix the frame.
+    deviations: Option<Deviations>,
+}
+
+struct Deviations {
+    noise_m: f64,
+    /// Of the scale, as a share of it, and of the heading in radians.
+    scale: f64,
+    middle_m: f64,
+}
+
+impl Fixed {
+    fn by(fixes: &[Fix]) -> Self {
+        let used: Vec<&Fix> = fixes.iter().filter(|fix| fix.agrees).collect();
+        let count = used.len().max(1) as f64;
+        let middle = used.iter().map(|fix| fix.center).sum::<Vector2<f64>>() / count;
+        let spread = used.iter().map(|fix| (fix.center - middle).norm_squared()).sum::<f64>().sqrt();
+        let deviations = (used.len() >= MIN_POSITIONS).then(|| {
+            // Of the two coordinates of each, four go into scale, heading and place.
+            let freedom = (2 * used.len() - 4) as f64;
+            let noise_m = (used.iter().map(|fix| fix.offset_m.powi(2)).sum::<f64>() / freedom).sqrt();
+            Deviations { noise_m, scale: noise_m / spread, middle_m: noise_m / count.sqrt() }
+        });
+        Self { count: used.len(), within_m: 2.0 * spread / count.sqrt(), deviations }
+    }
+}
+
+/// How many of `listed` images have positions, how far off these are, and how well they fix the frame.
 pub(super) fn note(fixes: &[Fix], listed: usize) -> String {
     let mut metres: Vec<f64> = fixes.iter().map(|fix| fix.offset_m).collect();
     metres.sort_by(f64::total_cmp);
     let median = metres.get(metres.len() / 2).copied().unwrap_or_default();
-    format!("positions: {} of {listed} images, median deviation {median:.2} m", fixes.len())
+    let positions = format!("positions: {} of {listed} images, median deviation {median:.2} m", fixes.len());
+    match Fixed::by(fixes).deviations {
+        Some(Deviations { scale, middle_m, .. }) => format!(
+            "{positions}; if each is off by its own they fix scale to ± {:.2} %, heading to ± {:.2}° and place to ± \
+             {middle_m:.2} m (one sigma)",
+            100.0 * scale,
+            scale.to_degrees()
+        ),
+        None => positions,
+    }
 }
 
 /// Says that few positions, or such as lie close together for their noise, fix scale and heading.
-///
-/// Of positions at distances rᵢ from their middle, each off by σ in either direction, scale and heading have the
-/// deviation σ / √Σrᵢ².
 pub(super) fn warning(fixes: &[Fix]) -> Option<String> {
-    let used: Vec<&Fix> = fixes.iter().filter(|fix| fix.agrees).collect();
-    let middle = used.iter().map(|fix| fix.center).sum::<Vector2<f64>>() / used.len().max(1) as f64;
-    let spread = used.iter().map(|fix| (fix.center - middle).norm_squared()).sum::<f64>().sqrt();
-    let within = 2.0 * spread / (used.len().max(1) as f64).sqrt();
-    if used.len() < MIN_POSITIONS {
+    let Fixed { count, within_m, deviations } = Fixed::by(fixes);
+    let Some(Deviations { noise_m, scale, .. }) = deviations else {
         return Some(format!(
-            "{} measured positions within {within:.1} m fix scale and heading, and nothing tells how far these are off",
-            used.len()
+            "{count} measured positions within {within_m:.1} m fix scale and heading, and nothing tells how far these are off"
         ));
-    }
-    // Of the two coordinates of each, four go into scale, heading and place.
-    let freedom = (2 * used.len() - 4) as f64;
-    let noise = (used.iter().map(|fix| fix.offset_m.powi(2)).sum::<f64>() / freedom).sqrt();
-    let deviation = noise / spread;
-    (deviation > POOR).then(|| {
+    };
+    (scale > POOR).then(|| {
         format!(
-            "{} measured positions within {within:.1} m fix scale and heading to ± {:.0} % and {:.0}° only: they are off by {noise:.1} m",
-            used.len(),
-            100.0 * deviation,
-            deviation.to_degrees()
+            "{count} measured positions within {within_m:.1} m fix scale and heading to ± {:.0} % and {:.0}° only: they are off by {noise_m:.1} m",
+            100.0 * scale,
+            scale.to_degrees()
         )
     })
 }
@@ -169,7 +202,7 @@ mod tests {
         let apart = [("a", 12.0), ("b", 16.06), ("c", 8.0)];
         let few = contradicted_positions(&apart[..2], 4);
         assert_eq!(few.len(), 2);
-        assert_eq!(few[1], "the measured position of b is 16.1 m off and was not used");
+        assert_eq!(few[1], "the measured position of b is 16.1 m off and hardly counts");
         assert_eq!(contradicted_positions(&apart, 13).len(), 3);
         let many = contradicted_positions(&apart, 12);
         assert_eq!(many.len(), 1);
@@ -188,7 +221,12 @@ mod tests {
         assert_eq!(said(3, 0.02), None);
         assert_eq!(said(20, 0.5), None);
         let mut fixes = row(5, 0.1);
-        assert_eq!(note(&fixes, 8), "positions: 5 of 8 images, median deviation 0.10 m");
+        assert_eq!(
+            note(&fixes, 8),
+            "positions: 5 of 8 images, median deviation 0.10 m; if each is off by its own they fix scale to ± 1.44 %, \
+             heading to ± 0.83° and place to ± 0.04 m (one sigma)"
+        );
+        assert_eq!(note(&fixes[..2], 8), "positions: 2 of 8 images, median deviation 0.10 m");
         // Those that contradict the others fix nothing.
         fixes.iter_mut().skip(2).for_each(|fix| fix.agrees = false);
         assert!(warning(&fixes).unwrap().starts_with("2 measured positions"));
