@@ -273,6 +273,11 @@ pub(crate) fn hold_by_positions(
     let poses = &problem.poses;
     problem.observations.retain(|seen| !poses[seen.pose as usize].fixed);
     problem.position_priors = positions.priors(&pose_of_image, problem.variance_factor(loss));
+    let offsets = problem.position_offsets();
+    let settled = problem.without_frame(&offsets);
+    for ((prior, offset), settled) in problem.position_priors.iter_mut().zip(offsets).zip(settled) {
+        prior.position += settled - offset;
+    }
 }
 
 /// Moves the poses of a problem that were left out of its adjustment as the nearest of the others has moved since `before`.

@@ -1,6 +1,6 @@
 //! Alignment of a component to measured positions.
 
-use nalgebra::{Matrix3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, SMatrix, SVector, UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -54,7 +54,8 @@ const LOSS_SIGMA: f64 = 2.0;
 /// Measured positions as part of an adjustment of a component that lies in their frame.
 ///
 /// What is off by little from each image to the next adds up along a street; positions are off by metres, but each by its own. The
-/// frame is free then, and is to be found anew afterwards ([`georegister`]): positions along a line do not fix the roll about it.
+/// frame is free then, but what moves it is taken off the positions: those along a line would turn all about it. It is to be found anew
+/// afterwards ([`georegister`]).
 #[derive(Debug, Clone, Copy)]
 pub struct MeasuredPositions<'a> {
     /// How certain they are.
@@ -82,6 +83,45 @@ impl MeasuredPositions<'_> {
         pose_of_image.iter().zip(self.by_image).filter_map(prior).collect()
     }
 }
+
+/// Offsets at some places without what a small shift, turn and change of scale of all of them explains, by least squares with
+/// weights by coordinate.
+pub(crate) fn without_frame(
+    places: &[Vector3<f64>],
+    offsets: &[Vector3<f64>],
+    weights: &[Vector3<f64>],
+) -> Vec<Vector3<f64>> {
+    let sum: f64 = weights.iter().map(Vector3::sum).sum();
+    let middle =
+        places.iter().zip(weights).map(|(place, weight)| place * weight.sum()).sum::<Vector3<f64>>() / sum;
+    let spread = places.iter().map(|place| (place - middle).norm_squared()).sum::<f64>();
+    let reach = (spread / places.len().max(1) as f64).sqrt();
+    if !(sum > 0.0 && reach > 0.0 && reach.is_finite()) {
+        return offsets.to_vec();
+    }
+    // What each coordinate of a place does under a step of the seven, by the mean distance from the middle.
+    let moves = |place: &Vector3<f64>| {
+        let from_middle = (place - middle) / reach;
+        let mut moves = SMatrix::<f64, 3, 7>::zeros();
+        moves.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
+        moves.fixed_view_mut::<3, 3>(0, 3).copy_from(&-from_middle.cross_matrix());
+        moves.set_column(6, &from_middle);
+        moves
+    };
+    let (mut normal, mut right) = (SMatrix::<f64, 7, 7>::zeros(), SVector::<f64, 7>::zeros());
+    for ((place, offset), weight) in places.iter().zip(offsets).zip(weights) {
+        let weighted = moves(place).transpose() * Matrix3::from_diagonal(&(weight / sum));
+        normal += weighted * moves(place);
+        right += weighted * offset;
+    }
+    // Places along a line tell no turn about it.
+    let Ok(inverse) = normal.pseudo_inverse(UNTOLD) else { return offsets.to_vec() };
+    let step = inverse * right;
+    places.iter().zip(offsets).map(|(place, offset)| offset - moves(place) * step).collect()
+}
+
+/// Share of their weight below which places do not tell a movement of all of them.
+const UNTOLD: f64 = 1e-9;
 
 /// Finds the similarity that maps camera centres onto measured positions, ignoring wrong measurements.
 ///
@@ -299,6 +339,32 @@ mod tests {
             measured.push(Some(at(truth.transform_point(&center) + noise)));
         }
         (reconstruction, measured, truth)
+    }
+
+    #[test]
+    fn what_moves_all_places_alike_is_taken_off_their_offsets() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let mut random = |reach: f64| Vector3::from_fn(|_, _| rng.random_range(-reach..reach));
+        let places: Vec<Vector3<f64>> =
+            (0..9).map(|_| random(20.0) + Vector3::new(300.0, -40.0, 5.0)).collect();
+        let weights: Vec<Vector3<f64>> = (0..9).map(|_| random(0.5).map(|value| value + 0.6)).collect();
+        let offsets: Vec<Vector3<f64>> = places.iter().map(|_| random(1.0)).collect();
+        let (shift, turn) = (random(3.0), random(0.3));
+        let moved: Vec<Vector3<f64>> = (places.iter().zip(&offsets))
+            .map(|(place, offset)| offset + shift + turn.cross(place) + place * 0.02)
+            .collect();
+        let rest = without_frame(&places, &offsets, &weights);
+        let size = |of: &[Vector3<f64>]| -> f64 {
+            of.iter().zip(&weights).map(|(at, weight)| at.component_mul(at).dot(weight)).sum()
+        };
+        assert!(size(&rest) < 0.9 * size(&offsets) && size(&rest) > 0.1 * size(&offsets));
+        for (same, rest) in without_frame(&places, &moved, &weights).iter().zip(&rest) {
+            assert!((same - rest).norm() < 1e-9, "{same} {rest}");
+        }
+        // Two places keep of what is off between them nothing but what is across them, and one nothing at all.
+        let two = without_frame(&places[..2], &offsets[..2], &weights[..2]);
+        assert!(size(&two) < 1e-9, "{two:?}");
+        assert_eq!(without_frame(&places[..1], &offsets[..1], &weights[..1]), offsets[..1]);
     }
 
     #[test]

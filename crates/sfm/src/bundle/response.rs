@@ -7,6 +7,7 @@ use super::normal_equations::{Model, NormalEquations};
 use super::residual::angular_squared;
 use super::spherical::{Layout, POSE_DIM, Spherical, bearing_and_weight};
 use super::{BundleObservation, BundleProblem, PositionPrior, RobustLoss, store};
+use crate::georegister::without_frame;
 
 /// Damping of the step, and what is tried where that is too little for the system to be definite in spite of rounding: the first is
 /// enough to keep a free gauge where it is, and too little for what bends a long chain to notice.
@@ -62,11 +63,25 @@ impl BundleProblem {
     /// What the measured positions are off, each by its own loss, as errors that move the minimum of the problem
     /// [`BundleProblem::reweighted`] as [`BundleProblem::residuals_under`] do.
     pub fn position_residuals(&self) -> Vec<Vector3<f64>> {
-        let residual = |prior: &PositionPrior| {
-            let offset = self.position_offset(prior)?;
-            Some(offset * pull(prior.loss, prior.squared(&offset)))
-        };
-        self.position_priors.iter().map(|prior| residual(prior).unwrap_or_default()).collect()
+        let priors = self.position_priors.iter().zip(self.position_offsets());
+        priors.map(|(prior, offset)| offset * pull(prior.loss, prior.squared(&offset))).collect()
+    }
+
+    /// From the poses' centres to where they were measured.
+    pub(crate) fn position_offsets(&self) -> Vec<Vector3<f64>> {
+        self.position_priors.iter().map(|prior| self.position_offset(prior).unwrap_or_default()).collect()
+    }
+
+    /// Such offsets without what moves the frame, each as far as its own measured position counts.
+    pub(crate) fn without_frame(&self, offsets: &[Vector3<f64>]) -> Vec<Vector3<f64>> {
+        let priors = self.position_priors.iter().zip(self.position_offsets());
+        let (places, weights): (Vec<_>, Vec<_>) = priors
+            .map(|(prior, offset)| {
+                let weight = prior.loss.evaluate(prior.squared(&offset)).1;
+                (prior.position - offset, prior.sigma.map(|sigma| weight / (sigma * sigma)))
+            })
+            .unzip();
+        without_frame(&places, offsets, &weights)
     }
 
     /// From a pose's centre to where it was measured.
