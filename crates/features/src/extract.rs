@@ -198,17 +198,15 @@ fn extract_beside(
         size,
         pixel: reduction.recip() as f32,
     };
-    let mut features = ImageFeatures { width, height, ..ImageFeatures::default() };
-    let is_faint;
-    if let Some(own) = known {
-        is_faint = !own.simulated.is_empty();
-        features = own.without_simulated_views();
+    let (mut features, is_faint) = if let Some(own) = known {
+        (own.without_simulated_views(), !own.simulated.is_empty())
     } else {
+        let mut features = ImageFeatures { width, height, ..ImageFeatures::default() };
         let view = View { grey: &grey, enlargement, tilt: [1.0; 2] };
         let (light, usual) = source.append_view(&view, params.max_features, &mut features);
         features.light = light;
-        is_faint = usual < params.min_features.min(params.max_features);
-    }
+        (features, usual < params.min_features.min(params.max_features))
+    };
     let tilt = if is_faint { params.simulated_tilt.max(params.faint_tilt) } else { params.simulated_tilt };
     if let Some(own) = known
         && is_faint

@@ -124,7 +124,7 @@ pub fn align_tracks<E: Send>(
     component: &mut Reconstruction,
     features: &[&ImageFeatures],
     camera_fixed: &[bool],
-    positions: Option<MeasuredPositions<'_>>,
+    positions: Option<&MeasuredPositions>,
     load: impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync,
 ) -> Result<AlignmentReport, E> {
     let registered: Vec<ImageId> = component.registered().collect();
@@ -240,13 +240,13 @@ fn solve(
     params: &BundleParams,
     problem: &mut BundleProblem,
     component: &Reconstruction,
-    positions: Option<MeasuredPositions<'_>>,
+    positions: Option<&MeasuredPositions>,
 ) {
     let Some(positions) = positions else {
         bundle::solve(params, problem);
         return;
     };
-    hold_by_positions(problem, component, &positions, params.loss);
+    hold_by_positions(problem, component, positions, params.loss);
     let before = problem.poses.clone();
     bundle::solve(params, problem);
     follow(problem, &before);
@@ -258,13 +258,9 @@ fn solve(
 pub(crate) fn hold_by_positions(
     problem: &mut BundleProblem,
     component: &Reconstruction,
-    positions: &MeasuredPositions<'_>,
+    positions: &MeasuredPositions,
     loss: RobustLoss,
 ) {
-    let mut pose_of_image = vec![None; component.images.len()];
-    for (pose, image) in (0..).zip(component.registered()) {
-        pose_of_image[image.index()] = Some(pose);
-    }
     let mut seen = vec![0; problem.poses.len()];
     problem.observations.iter().for_each(|observation| seen[observation.pose as usize] += 1);
     for (pose, seen) in problem.poses.iter_mut().zip(seen) {
@@ -272,7 +268,7 @@ pub(crate) fn hold_by_positions(
     }
     let poses = &problem.poses;
     problem.observations.retain(|seen| !poses[seen.pose as usize].fixed);
-    problem.position_priors = positions.priors(&pose_of_image, problem.variance_factor(loss));
+    problem.position_priors = positions.priors(component.registered(), problem.variance_factor(loss));
     let offsets = problem.position_offsets();
     let settled = problem.without_frame(&offsets);
     for ((prior, offset), settled) in problem.position_priors.iter_mut().zip(offsets).zip(settled) {

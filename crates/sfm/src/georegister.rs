@@ -56,31 +56,35 @@ const LOSS_SIGMA: f64 = 2.0;
 /// What is off by little from each image to the next adds up along a street; positions are off by metres, but each by its own. The
 /// frame is free then, but what moves it is taken off the positions: those along a line would turn all about it. It is to be found anew
 /// afterwards ([`georegister`]).
-#[derive(Debug, Clone, Copy)]
-pub struct MeasuredPositions<'a> {
+#[derive(Debug, Clone)]
+pub struct MeasuredPositions {
     /// How certain they are.
-    pub params: &'a GeoregisterParams,
+    pub params: GeoregisterParams,
     /// By image.
-    pub by_image: &'a [Option<MeasuredPosition>],
+    pub by_image: Vec<Option<MeasuredPosition>>,
 }
 
-impl MeasuredPositions<'_> {
-    /// Those of images that have a pose in an adjustment whose observations have this [variance over what they
+impl MeasuredPositions {
+    /// Those of the images whose poses an adjustment has, in its order, where observations have this [variance over what they
     /// state](crate::bundle::BundleProblem::variance_factor).
-    pub(crate) fn priors(&self, pose_of_image: &[Option<u32>], variance_factor: f64) -> Vec<PositionPrior> {
+    pub(crate) fn priors(
+        &self,
+        images: impl Iterator<Item = ImageId>,
+        variance_factor: f64,
+    ) -> Vec<PositionPrior> {
         let weight = OVERCONFIDENCE * variance_factor.sqrt();
         let horizontal = self.params.gps_sigma_m / weight;
-        let prior = |(pose, measured): (&Option<u32>, &Option<MeasuredPosition>)| {
-            let MeasuredPosition { enu, has_height } = (*measured)?;
+        let prior = |(pose, image): (u32, ImageId)| {
+            let MeasuredPosition { enu, has_height } = (*self.by_image.get(image.index())?)?;
             let vertical = if has_height { horizontal * self.params.height_factor } else { f64::INFINITY };
             Some(PositionPrior {
-                pose: (*pose)?,
+                pose,
                 position: enu,
                 sigma: Vector3::new(horizontal, horizontal, vertical),
                 loss: RobustLoss::Cauchy(LOSS_SIGMA * weight),
             })
         };
-        pose_of_image.iter().zip(self.by_image).filter_map(prior).collect()
+        (0..).zip(images).filter_map(prior).collect()
     }
 }
 

@@ -67,14 +67,14 @@ impl ModelErrors {
     /// hemispheres share besides is not in it, as the poses take it up; nor is a fold.
     ///
     /// `positions` are those that it was adjusted to, too; what *all* of them are off is in no draw.
-    pub fn of_model(model: &Reconstruction, positions: Option<MeasuredPositions<'_>>) -> Option<Self> {
+    pub fn of_model(model: &Reconstruction, positions: Option<&MeasuredPositions>) -> Option<Self> {
         let images: Vec<ImageId> = model.registered().collect();
         if shares_standpoints(model, &images) {
             return None;
         }
         let (mut places, pose_of_image) = problem_of(model);
         if let Some(positions) = positions {
-            hold_by_positions(&mut places, model, &positions, LOSS);
+            hold_by_positions(&mut places, model, positions, LOSS);
         }
         let problem = places.reweighted(LOSS);
         let (residuals, position_residuals) = (places.residuals_under(LOSS), places.position_residuals());
@@ -433,17 +433,17 @@ mod tests {
                     Some(MeasuredPosition { enu, has_height: at % 20 != 3 })
                 })
                 .collect();
-            let positions = MeasuredPositions { params: &params, by_image: &measured };
+            let positions = MeasuredPositions { params: params.clone(), by_image: measured };
             let adjustment = bundle::BundleParams {
                 loss: LOSS,
                 max_iterations: 200,
                 function_tolerance: 1e-7,
                 ..bundle::BundleParams::default()
             };
-            let adjusted = |positions: Option<MeasuredPositions<'_>>| {
+            let adjusted = |positions: Option<&MeasuredPositions>| {
                 let (mut model, mut problem) = (seen.clone(), problem_of(&seen).0);
                 if let Some(positions) = positions {
-                    hold_by_positions(&mut problem, &seen, &positions, adjustment.loss);
+                    hold_by_positions(&mut problem, &seen, positions, adjustment.loss);
                 }
                 bundle::solve(&adjustment, &mut problem);
                 take(&mut model, &problem);
@@ -456,9 +456,9 @@ mod tests {
                 (model, pairs.iter().map(off).sum::<f64>() / pairs.len() as f64)
             };
             apart += adjusted(None).1;
-            let (model, squared) = adjusted(Some(positions));
+            let (model, squared) = adjusted(Some(&positions));
             held += squared;
-            let errors = ModelErrors::of_model(&model, Some(positions)).expect("has places");
+            let errors = ModelErrors::of_model(&model, Some(&positions)).expect("has places");
             let stated =
                 |image| errors.deviation(&model, ImageId(image)).expect("is registered").center.powi(2);
             ratio += squared / ((0..60).map(stated).sum::<f64>() / 60.0) / 3.0;
@@ -479,8 +479,8 @@ mod tests {
                 Some(MeasuredPosition { enu: pose.translation + off, has_height: true })
             })
             .collect();
-        let positions = MeasuredPositions { params: &params, by_image: &measured };
-        let [with, without] = [Some(positions), None].map(|positions| {
+        let positions = MeasuredPositions { params: params.clone(), by_image: measured };
+        let [with, without] = [Some(&positions), None].map(|positions| {
             let errors = ModelErrors::of_model(&model, positions).expect("has places");
             let stated = |image| errors.deviation(&model, ImageId(image)).expect("is registered");
             let stated: Vec<PoseDeviation> = (0..6).map(stated).collect();

@@ -214,7 +214,7 @@ impl<'a> Search<'a> {
 
 vectorized! {
     /// Squared distances of a descriptor from some of an image's.
-    pub(super) fn squared_distances(query: &[u8], base: &[u8], candidates: &[u32], distances: &mut Vec<u32>) {
+    fn squared_distances(query: &[u8], base: &[u8], candidates: &[u32], distances: &mut Vec<u32>) {
         distances.clear();
         distances.resize(candidates.len(), 0);
         // With lengths that are known the loop has no rest.
@@ -228,7 +228,7 @@ vectorized! {
 
 vectorized! {
     /// Sines of the angles between bearings, by their coordinates, and a plane of unit normal.
-    pub(super) fn sines_to_plane(bearings: [&[f64]; 3], normal: &Vector3<f64>, sines: &mut Vec<f64>) {
+    fn sines_to_plane(bearings: [&[f64]; 3], normal: &Vector3<f64>, sines: &mut Vec<f64>) {
         let [x, y, z] = bearings;
         sines.clear();
         sines.resize(x.len(), 0.0);

@@ -180,7 +180,7 @@ impl GreyImage {
 vectorized! {
     /// Turns places within [0, 2·[`REACH`]) into how far they lie from the pixels to their upper left, and says where in rows of this
     /// width these are.
-    pub(super) fn split(columns: &mut [f32], rows: &mut [f32], width: i32, offsets: &mut [i32]) {
+    fn split(columns: &mut [f32], rows: &mut [f32], width: i32, offsets: &mut [i32]) {
         const MOST: f32 = 2.0 * REACH as f32;
         for ((x, y), offset) in columns.iter_mut().zip(rows).zip(offsets) {
             #[allow(clippy::manual_clamp, reason = "not a number must become 0")]
@@ -196,7 +196,7 @@ vectorized! {
 
 vectorized! {
     /// Between four pixels, by the shares of the right and the lower ones.
-    pub(super) fn interpolate(corners: &[[u8; 4]], right: &[f32], lower: &[f32], values: &mut [f32]) {
+    fn interpolate(corners: &[[u8; 4]], right: &[f32], lower: &[f32], values: &mut [f32]) {
         for (((corners, &right), &lower), value) in corners.iter().zip(right).zip(lower).zip(values) {
             let [a, b, c, d] = corners.map(f32::from);
             let (above, below) = (a + right * (b - a), c + right * (d - c));
@@ -207,7 +207,7 @@ vectorized! {
 
 vectorized! {
     /// Four rows by the weights (1, 3, 3, 1).
-    pub(super) fn add_rows(rows: [&[u8]; 4], sums: &mut [u16]) {
+    fn add_rows(rows: [&[u8]; 4], sums: &mut [u16]) {
         let [a, b, c, d] = rows.map(|row| &row[..sums.len()]);
         for (x, sum) in sums.iter_mut().enumerate() {
             *sum = u16::from(a[x]) + 3 * (u16::from(b[x]) + u16::from(c[x])) + u16::from(d[x]);
@@ -217,7 +217,7 @@ vectorized! {
 
 vectorized! {
     /// Every second column by the weights (1, 3, 3, 1)/64, the first in the middle of the first four sums.
-    pub(super) fn halve_row(sums: &[u16], target: &mut [u8]) {
+    fn halve_row(sums: &[u16], target: &mut [u8]) {
         let (pairs, next) = (sums.as_chunks::<2>().0, sums[2..].as_chunks::<2>().0);
         for ((target, &[a, b]), &[c, d]) in target.iter_mut().zip(pairs).zip(next) {
             *target = ((a + d + 3 * (b + c) + 32) >> 6) as u8;

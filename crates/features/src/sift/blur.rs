@@ -52,7 +52,7 @@ impl Blur {
 }
 
 vectorized! {
-    pub(super) fn blur_rows(
+    fn blur_rows(
         weights: &[f32],
         source: &Plane,
         target: &mut Plane,

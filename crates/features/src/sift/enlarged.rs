@@ -86,7 +86,7 @@ fn keys(distance: f64) -> f64 {
 }
 
 vectorized! {
-    pub(super) fn weigh_rows(rows: [&[u8]; TAPS], weights: &[f32; TAPS], target: &mut [f32]) {
+    fn weigh_rows(rows: [&[u8]; TAPS], weights: &[f32; TAPS], target: &mut [f32]) {
         let [first, second, third, fourth] = rows;
         for (((target, &first), (&second, &third)), &fourth) in
             target.iter_mut().zip(first).zip(second.iter().zip(third)).zip(fourth)
@@ -100,7 +100,7 @@ vectorized! {
 }
 
 vectorized! {
-    pub(super) fn weigh_columns(row: &[f32], columns: &[Taps], target: &mut [f32]) {
+    fn weigh_columns(row: &[f32], columns: &[Taps], target: &mut [f32]) {
         for (target, Taps { first, weights }) in target.iter_mut().zip(columns) {
             let from = &row[*first..][..TAPS];
             *target = weights[0] * from[0] + weights[1] * from[1] + weights[2] * from[2] + weights[3] * from[3];

@@ -119,7 +119,7 @@ impl Scan {
 
 vectorized! {
     /// Puts row `y` of all differences into its slot.
-    pub(super) fn subtract_row(layers: &[Plane], y: usize, rows: &mut Scan) {
+    fn subtract_row(layers: &[Plane], y: usize, rows: &mut Scan) {
         for (index, slots) in rows.differences.iter_mut().enumerate() {
             let (finer, coarser) = (layers[index].row(y), layers[index + 1].row(y));
             for ((target, &finer), &coarser) in slots[y % 3].iter_mut().zip(finer).zip(coarser) {
@@ -133,7 +133,7 @@ vectorized! {
     /// Marks the pixels of a row beyond the threshold that neither the next one in the row nor that in the column exceeds.
     ///
     /// Of four neighbours in place of all, since these leave one pixel in ten and only pixels beyond the threshold count.
-    pub(super) fn flag_candidates(rows: &mut Scan, layer: usize, y: usize, threshold: f32) {
+    fn flag_candidates(rows: &mut Scan, layer: usize, y: usize, threshold: f32) {
         let [above, row, below] = slots(y).map(|slot| &rows.differences[layer][slot][..]);
         let inner = row.len() - 2;
         let (left, here, right) = (&row[..inner], &row[1..][..inner], &row[2..][..inner]);

@@ -108,7 +108,7 @@ pub(super) fn grey(kept: Kept) -> f32 {
 }
 
 vectorized! {
-    pub(super) fn keep(row: &[f32], target: &mut [Kept]) {
+    fn keep(row: &[f32], target: &mut [Kept]) {
         // In floats of this size the last bit is worth 1; compilers turn conversions that must bear any number into single ones.
         const ROUNDING: f32 = 8_388_608.0;
         for (target, &value) in target.iter_mut().zip(row) {

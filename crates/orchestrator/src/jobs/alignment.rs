@@ -94,9 +94,8 @@ fn run_alignment(
             let (path, hash) = &sources[image_at[image.index()]];
             pyramids.get((path, *hash), wraps[image.index()])
         };
-        let by_image = measured.by_image(component);
-        let positions = placed.is_some().then(|| measured.for_adjustment(&by_image));
-        let report = align_tracks(params, component, &features, camera_fixed, positions, load)?;
+        let positions = measured.for_adjustment(component, placed.as_ref());
+        let report = align_tracks(params, component, &features, camera_fixed, positions.as_ref(), load)?;
         sharpen_lengths(component, load)?;
         let registered = register_by_ground(component, &waiting, &features, load)?;
         if placed.is_some() {

@@ -32,7 +32,7 @@ impl Measurements {
     }
 
     /// The positions by a component's own numbers of its images.
-    pub fn by_image(&self, component: &Reconstruction) -> Vec<Option<MeasuredPosition>> {
+    fn by_image(&self, component: &Reconstruction) -> Vec<Option<MeasuredPosition>> {
         let images = component.images.iter();
         images.map(|image| *self.positions.get(image_of_place_holder(&image.name)?)?).collect()
     }
@@ -53,9 +53,13 @@ impl Measurements {
         Some(placed)
     }
 
-    /// The positions as part of an adjustment, by what [`Measurements::by_image`] gives.
-    pub fn for_adjustment<'a>(&'a self, by_image: &'a [Option<MeasuredPosition>]) -> MeasuredPositions<'a> {
-        MeasuredPositions { params: &self.params, by_image }
+    /// The positions as part of a component's adjustment, where they have placed it.
+    pub fn for_adjustment(
+        &self,
+        component: &Reconstruction,
+        placed: Option<&Georegistration>,
+    ) -> Option<MeasuredPositions> {
+        placed.map(|_| MeasuredPositions { params: self.params.clone(), by_image: self.by_image(component) })
     }
 
     /// Says where the positions do not fix a component's place, or contradict it.

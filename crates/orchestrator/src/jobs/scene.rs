@@ -240,9 +240,8 @@ pub fn add_scene(
         let errors: Vec<Option<ModelErrors>> = (output.components.iter())
             .zip(&output.report.georegistrations)
             .map(|(component, placed)| {
-                let by_image = measured.by_image(component);
-                let positions = placed.as_ref().map(|_| measured.for_adjustment(&by_image));
-                ModelErrors::of_model(component, positions)
+                let positions = measured.for_adjustment(component, placed.as_ref());
+                ModelErrors::of_model(component, positions.as_ref())
             })
             .collect();
         let is_placed = georegistrations().next() == Some(true) && origin.is_some();

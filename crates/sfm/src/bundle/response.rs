@@ -32,11 +32,9 @@ impl BundleProblem {
                 seen.sigma /= loss.mean_curvature(squared).sqrt();
             }
         }
-        for prior in &mut weighted.position_priors {
-            if let Some(squared) = self.position_offset(prior).map(|offset| prior.squared(&offset)) {
-                prior.sigma /= prior.loss.mean_curvature(squared).sqrt();
-                prior.loss = RobustLoss::Trivial;
-            }
+        for (prior, offset) in weighted.position_priors.iter_mut().zip(self.position_offsets()) {
+            prior.sigma /= prior.loss.mean_curvature(prior.squared(&offset)).sqrt();
+            prior.loss = RobustLoss::Trivial;
         }
         weighted
     }
@@ -67,9 +65,12 @@ impl BundleProblem {
         priors.map(|(prior, offset)| offset * pull(prior.loss, prior.squared(&offset))).collect()
     }
 
-    /// From the poses' centres to where they were measured.
+    /// From the poses' centres to where they were measured; nothing where there is no such pose.
     pub(crate) fn position_offsets(&self) -> Vec<Vector3<f64>> {
-        self.position_priors.iter().map(|prior| self.position_offset(prior).unwrap_or_default()).collect()
+        let offset = |prior: &PositionPrior| {
+            Some(prior.position - self.poses.get(prior.pose as usize)?.world_from_camera.translation)
+        };
+        self.position_priors.iter().map(|prior| offset(prior).unwrap_or_default()).collect()
     }
 
     /// Such offsets without what moves the frame, each as far as its own measured position counts.
@@ -82,11 +83,6 @@ impl BundleProblem {
             })
             .unzip();
         without_frame(&places, offsets, &weights)
-    }
-
-    /// From a pose's centre to where it was measured.
-    fn position_offset(&self, prior: &PositionPrior) -> Option<Vector3<f64>> {
-        Some(prior.position - self.poses.get(prior.pose as usize)?.world_from_camera.translation)
     }
 
     /// What the observations are off, as errors of their bearings (camera frames, across, in radians) that move the minimum of the
