@@ -107,12 +107,19 @@ pub struct AlignmentReport {
     pub further: usize,
 }
 
+/// What is known of a component beside its images.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct KnownOfComponent<'a> {
+    /// Whose intrinsics are, by camera; those of cameras beyond the end, which the mapper added, are not.
+    pub cameras: &'a [bool],
+    /// Measured positions in the frame of the component, which moves in it by little.
+    pub positions: Option<&'a MeasuredPositions>,
+}
+
 /// Aligns the tracks of a component and adjusts it.
 ///
-/// `features` are those of the component's images, by id; `camera_fixed` says whose intrinsics are known, and those of
-/// cameras beyond its end, which the mapper added, are not. `positions` are in the frame of the component, which moves in it by
-/// little. `load` gives the pixels of a registered image and may be called
-/// five times for each, from several threads.
+/// `features` are those of the component's images, by id. `load` gives the pixels of a registered image and may be called five times
+/// for each, from several threads.
 ///
 /// In a component in which photos share a standpoint nothing moves, as what ties their centres together is not known
 /// here: its points get their places only.
@@ -123,8 +130,7 @@ pub fn align_tracks<E: Send>(
     params: &AlignmentParams,
     component: &mut Reconstruction,
     features: &[&ImageFeatures],
-    camera_fixed: &[bool],
-    positions: Option<&MeasuredPositions>,
+    known: KnownOfComponent<'_>,
     load: impl Fn(ImageId) -> Result<Arc<ImagePyramid>, E> + Sync,
 ) -> Result<AlignmentReport, E> {
     let registered: Vec<ImageId> = component.registered().collect();
@@ -158,8 +164,8 @@ pub fn align_tracks<E: Send>(
         ..BundleParams::default()
     };
     let first = BundleParams { function_tolerance: FIRST_TOLERANCE, ..bundle };
-    let mut problem = tracks.problem(camera_fixed, &aligned, &tracks.middles(&aligned), &[]);
-    solve(&first, &mut problem, tracks.component, positions);
+    let mut problem = tracks.problem(known.cameras, &aligned, &tracks.middles(&aligned), &[]);
+    solve(&first, &mut problem, tracks.component, known.positions);
     let (references, planes) = (tracks.references, tracks.planes);
     store(component, features, &problem);
     // Now it is known where the patches lie in views that no keypoint ties to them.
@@ -170,8 +176,8 @@ pub fn align_tracks<E: Send>(
     })?
     .concat();
     report.further = further.len();
-    let mut problem = tracks.problem(camera_fixed, &aligned, &middles, &further);
-    solve(&bundle, &mut problem, tracks.component, positions);
+    let mut problem = tracks.problem(known.cameras, &aligned, &middles, &further);
+    solve(&bundle, &mut problem, tracks.component, known.positions);
     let placed = tracks.placed(&aligned, &middles, &further);
     store(component, features, &problem);
     for (point, placed) in component.points.iter_mut().zip(placed) {

@@ -21,7 +21,7 @@ mod two_view;
 mod visibility;
 mod walls;
 
-pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, align_tracks};
+pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, KnownOfComponent, align_tracks};
 pub use geometry::{Rigid, Similarity, nearest_rotation};
 pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, MeasuredPositions, georegister};
 pub use ground::{register_by_ground, sharpen_lengths};

@@ -8,8 +8,8 @@ use rand::Rng;
 use setloc_features::{Camera, GreyImage, ImageFeatures, ImagePyramid, Keypoint};
 use setloc_sfm::synthetic::{normal, normal_vector, random_rotation, random_unit, seeded};
 use setloc_sfm::{
-    AlignmentParams, AlignmentReport, CameraId, ImageId, Observation, Reconstruction, ReconstructionImage,
-    ReconstructionPoint, Rigid, Similarity, align_tracks,
+    AlignmentParams, AlignmentReport, CameraId, ImageId, KnownOfComponent, Observation, Reconstruction,
+    ReconstructionImage, ReconstructionPoint, Rigid, Similarity, align_tracks,
 };
 
 /// Half of the room's extents in metres.
@@ -118,7 +118,14 @@ impl Room {
     fn align(&self, params: &AlignmentParams) -> (Reconstruction, AlignmentReport) {
         let (mut model, features) = (self.model.clone(), self.features.iter().collect::<Vec<_>>());
         let load = |image: ImageId| Ok::<_, Infallible>(Arc::clone(&self.pyramids[image.index()]));
-        let report = align_tracks(params, &mut model, &features, &[true], None, load).unwrap();
+        let report = align_tracks(
+            params,
+            &mut model,
+            &features,
+            KnownOfComponent { cameras: &[true], positions: None },
+            load,
+        )
+        .unwrap();
         (model, report)
     }
 
@@ -198,7 +205,13 @@ fn unreadable_images_leave_the_model_alone() {
     let features: Vec<&ImageFeatures> = room.features.iter().collect();
     let mut model = room.model.clone();
     let load = |image: ImageId| if image.0 == 2 { Err("gone") } else { Ok(Arc::clone(&room.pyramids[0])) };
-    let failed = align_tracks(&AlignmentParams::default(), &mut model, &features, &[true], None, load);
+    let failed = align_tracks(
+        &AlignmentParams::default(),
+        &mut model,
+        &features,
+        KnownOfComponent { cameras: &[true], positions: None },
+        load,
+    );
     assert_eq!((failed, &model), (Err("gone"), &room.model));
 }
 

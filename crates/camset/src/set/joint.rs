@@ -95,6 +95,14 @@ pub(crate) struct Component<'a> {
     pub views: &'a Views,
 }
 
+/// What a local model and the scene show alike.
+#[derive(Clone, Copy)]
+struct Shared<'a> {
+    candidates: &'a [SetCorrespondence],
+    sights: &'a Sights,
+    walls: &'a [WallSight],
+}
+
 /// The joint refinement's result.
 struct Joint {
     model: JointModel,
@@ -209,7 +217,8 @@ impl Component<'_> {
             }
             return ComponentAnswer::Refused { reasons, scene_points };
         }
-        let mut joint = self.refine_jointly(&set_from_camera, &candidates, &sights, &rigid, &[]);
+        let mut shared = Shared { candidates: &candidates, sights: &sights, walls: &[] };
+        let mut joint = self.refine_jointly(&set_from_camera, shared, &rigid);
         self.follow_pairs(&mut joint);
         evidence.log10_false_alarms = evidence.log10_false_alarms.min(self.joint_false_alarms(&joint));
         let mut support = judge_support(&params.verdict, &evidence, &mut reasons);
@@ -228,7 +237,8 @@ impl Component<'_> {
                     &sights,
                     params.max_error_sigmas,
                 );
-                joint = self.refine_jointly(&set_from_camera, &candidates, &sights, &rigid, &by_walls.sights);
+                shared.walls = &by_walls.sights;
+                joint = self.refine_jointly(&set_from_camera, shared, &rigid);
                 self.follow_pairs(&mut joint);
                 elsewhere = joint.walls.iter().sum();
                 reasons.push(by_walls.reason);
@@ -545,20 +555,15 @@ impl Component<'_> {
     }
 
     /// The paper's T_OPT, with further rounds where the last one shows that photos are stretched.
-    fn refine_jointly(
-        &self,
-        set_from_camera: &[Rigid],
-        candidates: &[SetCorrespondence],
-        sights: &Sights,
-        rigid: &RigidPose,
-        walls: &[WallSight],
-    ) -> Joint {
+    fn refine_jointly(&self, set_from_camera: &[Rigid], shared: Shared<'_>, rigid: &RigidPose) -> Joint {
         let first = self.rigid_model(set_from_camera, &rigid.world_from_set);
-        let refined =
-            |model, first_round| self.refine_in_rounds(model, first_round, candidates, sights, rigid, walls);
-        let joint = refined(first, 0);
-        // The last round has freed it where matches were already right; freed from the rigid pose on it bends to wrong ones.
-        if joint.model.stretch.is_free { refined(joint.model, self.params.rounds.min(1)) } else { joint }
+        let joint = self.refine_in_rounds(first, 0, shared, rigid);
+        if joint.model.stretch.is_free {
+            // The last round has freed it where matches were already right; freed from the rigid pose on it bends to wrong ones.
+            self.refine_in_rounds(joint.model, self.params.rounds.min(1), shared, rigid)
+        } else {
+            joint
+        }
     }
 
     /// The set as it lies in the scene by its rigid pose.
@@ -587,11 +592,10 @@ impl Component<'_> {
         &self,
         mut model: JointModel,
         first_round: usize,
-        candidates: &[SetCorrespondence],
-        sights: &Sights,
+        shared: Shared<'_>,
         rigid: &RigidPose,
-        walls: &[WallSight],
     ) -> Joint {
+        let Shared { candidates, sights, walls } = shared;
         let world_from_set = &rigid.world_from_set;
         let mut covariances = Vec::new();
         for round in first_round..=self.params.rounds {

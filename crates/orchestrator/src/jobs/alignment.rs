@@ -7,7 +7,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use anyhow::{Context, Result};
 use serde_json::json;
 use setloc_features::ImageFeatures;
-use setloc_sfm::{AlignmentParams, ImageId, MapperOutput, align_tracks, register_by_ground, sharpen_lengths};
+use setloc_sfm::{
+    AlignmentParams, ImageId, KnownOfComponent, MapperOutput, align_tracks, register_by_ground,
+    sharpen_lengths,
+};
 
 use super::model::{features_role, image_of_place_holder, read_unchanged};
 use super::positions::Measurements;
@@ -21,14 +24,20 @@ const KEPT_BYTES: usize = 1 << 30;
 /// Bytes a pixel of an image in work: decoded, grey and reduced.
 const WORKING_BYTES: u64 = 8;
 
-/// Adds the alignment of a model; `camera_fixed` says whose intrinsics are known, by the model's cameras.
+/// What is known of a model beside its images.
+pub(super) struct KnownOfModel {
+    /// Whose intrinsics are, by the model's cameras.
+    pub cameras: Vec<bool>,
+    pub measured: Measurements,
+}
+
+/// Adds the alignment of a model.
 pub(super) fn add_alignment(
     graph: &mut JobGraph<'_>,
     images: &[SourceImage],
     (features, model): (&[JobId], JobId),
-    camera_fixed: Vec<bool>,
+    known: KnownOfModel,
     params: &AlignmentParams,
-    measured: Measurements,
 ) -> JobId {
     let external =
         images.iter().enumerate().map(|(at, image)| (format!("image {at:04}"), image.hash)).collect();
@@ -37,14 +46,13 @@ pub(super) fn add_alignment(
     let memory = pixels.sum::<u64>().min(KEPT_BYTES as u64) + 2 * WORKING_BYTES * largest;
     let sources: Vec<(PathBuf, ContentHash)> =
         images.iter().map(|image| (image.path.clone(), image.hash)).collect();
-    let mut job_params = json!({ "alignment": params, "camera_fixed": camera_fixed });
-    if !measured.is_empty() {
-        let Measurements { params, positions, seed } = &measured;
+    let mut job_params = json!({ "alignment": params, "camera_fixed": known.cameras });
+    if !known.measured.is_empty() {
+        let Measurements { params, positions, seed } = &known.measured;
         job_params["measured"] = json!([params, positions, seed]);
     }
     let params = params.clone();
-    let work =
-        move |inputs: &Inputs<'_, '_>| run_alignment(inputs, &params, &camera_fixed, &measured, &sources);
+    let work = move |inputs: &Inputs<'_, '_>| run_alignment(inputs, &params, &known, &sources);
     let aligned = graph.add(Job {
         kind: "aligned",
         version: stages::ALIGNMENT_VERSION,
@@ -64,8 +72,7 @@ pub(super) fn add_alignment(
 fn run_alignment(
     inputs: &Inputs<'_, '_>,
     params: &AlignmentParams,
-    camera_fixed: &[bool],
-    measured: &Measurements,
+    known: &KnownOfModel,
     sources: &[(PathBuf, ContentHash)],
 ) -> Result<Product> {
     params.patch.validate()?;
@@ -94,12 +101,13 @@ fn run_alignment(
             let (path, hash) = &sources[image_at[image.index()]];
             pyramids.get((path, *hash), wraps[image.index()])
         };
-        let positions = measured.for_adjustment(component, placed.as_ref());
-        let report = align_tracks(params, component, &features, camera_fixed, positions.as_ref(), load)?;
+        let positions = known.measured.for_adjustment(component, placed.as_ref());
+        let known_here = KnownOfComponent { cameras: &known.cameras, positions: positions.as_ref() };
+        let report = align_tracks(params, component, &features, known_here, load)?;
         sharpen_lengths(component, load)?;
         let registered = register_by_ground(component, &waiting, &features, load)?;
         if placed.is_some() {
-            *placed = measured.place(component).or(placed.take());
+            *placed = known.measured.place(component).or(placed.take());
         }
         waiting.retain(|pair| ![pair.first, pair.second].iter().any(|image| registered.contains(image)));
         if report.aligned * 5 < report.sought {

@@ -15,7 +15,7 @@ use setloc_sfm::{
     reconstruct, verify_pair,
 };
 
-use super::alignment::add_alignment;
+use super::alignment::{KnownOfModel, add_alignment};
 use super::derived_seed;
 use super::positions::Measurements;
 use crate::artifacts::{PairMatches, TurnedPair, VerifiedPair};
@@ -121,7 +121,8 @@ pub fn add_model(
         graph.accept(model, matches_role(a, b), used.matches);
     }
     let model = if config.alignment.enabled {
-        add_alignment(graph, images, (&features, model), fixed, &config.alignment, measured.clone())
+        let known = KnownOfModel { cameras: fixed, measured: measured.clone() };
+        add_alignment(graph, images, (&features, model), known, &config.alignment)
     } else {
         model
     };
