@@ -7,15 +7,13 @@
 //! 0.3 %, without a residual that stands out. All photos of a set together tell.
 
 use nalgebra::{UnitQuaternion, Vector2};
-use setloc_features::Camera;
+use setloc_features::{Camera, ParamRole};
 use setloc_sfm::Place;
 use setloc_sfm::bundle::{BundleProblem, CameraPrior, IntrinsicsFreedom};
 
 use crate::Scene;
 use crate::refine::place_on;
 
-/// Terms of a stretch.
-const TERMS: usize = 4;
 /// Standard deviation of the terms that turn with the photo's heading. Panoramas of consumer cameras stretch by 0.2–0.6 %.
 const SIGMA: f64 = 0.003;
 /// Share of the cost that stretches must spare to be believed: true intrinsics of four rendered sets spare at most 0.8 %, those of
@@ -50,7 +48,7 @@ impl PhotoStretch {
     /// Whether these stretches spare more than noise would.
     pub fn is_worth(&self, freed: &Freed, as_told: f64, stretched: f64) -> bool {
         let spared = as_told - stretched;
-        let parameters = TERMS * freed.cameras.len();
+        let parameters = freed.terms * freed.cameras.len();
         let enough = if self.is_likely { 0.0 } else { LEAST_PER_PARAMETER * parameters as f64 };
         spared > LEAST_SPARED * as_told && spared > enough
     }
@@ -67,6 +65,8 @@ impl PhotoStretch {
 #[derive(Debug, Default)]
 pub(crate) struct Freed {
     cameras: Vec<usize>,
+    /// Parameters that are estimated of each.
+    terms: usize,
 }
 
 impl Freed {
@@ -74,6 +74,7 @@ impl Freed {
     pub fn new(problem: &mut BundleProblem, sphere: &Camera, poses: &[usize]) -> Self {
         let (mut freed, mut told) = (Self::default(), vec![None; problem.poses.len()]);
         let Some(stitched) = sphere.as_stitched() else { return freed };
+        freed.terms = stitched.param_roles().iter().filter(|role| **role == ParamRole::Stretch).count();
         problem.camera_freedom.resize(problem.cameras.len(), IntrinsicsFreedom::FIXED);
         for &pose in poses {
             let at = problem.cameras.len();
@@ -164,7 +165,7 @@ mod tests {
 
     #[test]
     fn noise_is_not_worth_a_stretch_that_nothing_else_speaks_for() {
-        let freed = Freed { cameras: vec![3, 4] };
+        let freed = Freed { cameras: vec![3, 4], terms: 4 };
         let (unlikely, likely) =
             (PhotoStretch::default(), PhotoStretch { is_likely: true, ..PhotoStretch::default() });
         for stretch in [unlikely, likely] {

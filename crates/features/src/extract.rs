@@ -62,6 +62,11 @@ impl FeatureParams {
     /// place of doubled.
     pub const VERSION: u32 = 9;
 
+    /// Whether [`extract_simulated_views`] finds more in an image than `own`: views of faint images are simulated from the first.
+    pub fn adds_views_to(&self, own: &ImageFeatures) -> bool {
+        own.simulated.is_empty() || self.simulated_tilt > self.faint_tilt
+    }
+
     /// Checks the ranges.
     ///
     /// # Errors
@@ -209,8 +214,7 @@ fn extract_beside(
     };
     let tilt = if is_faint { params.simulated_tilt.max(params.faint_tilt) } else { params.simulated_tilt };
     if let Some(own) = known
-        && is_faint
-        && tilt <= params.faint_tilt
+        && !params.adds_views_to(own)
     {
         return Ok(own.clone());
     }

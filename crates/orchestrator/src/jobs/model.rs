@@ -211,11 +211,15 @@ fn add_features(
     }
     let (path, hash, features) = (image.path.clone(), image.hash, features.clone());
     let work = move |inputs: &Inputs<'_, '_>| {
+        let own = inputs.find::<ImageFeatures>("own")?;
+        if let Some(own) = own.as_deref().filter(|own| !features.adds_views_to(own)) {
+            return Product::new(own.clone());
+        }
         let bytes = read_unchanged(&path, hash)?;
         let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
         let mask = mask.as_ref().map(|(path, hash)| read_mask(path, *hash)).transpose()?;
         let mask = mask.as_ref();
-        Product::new(match inputs.find::<ImageFeatures>("own")? {
+        Product::new(match own {
             Some(own) => stages::extract_simulated_views(&features, &decoded, &camera, mask, &own)?,
             None => stages::extract(&features, &decoded, &camera, mask)?,
         })
