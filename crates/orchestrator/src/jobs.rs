@@ -2,19 +2,23 @@
 
 mod accuracy;
 mod alignment;
+mod features;
 mod grow;
 mod likely;
 mod locate;
+mod matching;
 mod model;
 mod pairs;
 mod pixels;
 mod positions;
 mod scene;
 
+pub use features::add_features_of;
 pub use grow::{LocatedJobs, add_grown};
 pub use likely::LikelyJobs;
 pub use locate::{LocateJobs, SetJobs, add_set, add_singles};
-pub use model::{ModelJobs, ModelKind, add_features_of, add_model, add_turned, divided_guesses};
+pub use matching::{PairSource, add_turned};
+pub use model::{ModelJobs, ModelKind, add_model, divided_guesses};
 pub use pairs::choose_pairs;
 pub use scene::{SceneJobs, SceneModelJobs, add_first_model, add_scene};
 

@@ -12,7 +12,7 @@ use crate::artifacts::TurnedPair;
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, SourceImage};
 use crate::graph::{JobGraph, RunResult};
-use crate::jobs::{add_features_of, add_turned, choose_pairs};
+use crate::jobs::{PairSource, add_features_of, add_turned, choose_pairs};
 use crate::session::Session;
 use crate::stages::FeatureParams;
 use crate::text::some_of;
@@ -40,7 +40,7 @@ pub fn guess_by_turns(
     let features = add_features_of(&mut graph, images, features);
     let mut jobs = Vec::new();
     for &pair in &pairs {
-        let job = add_turned(&mut graph, images, &features, pair, config, seed);
+        let job = add_turned(&mut graph, PairSource { images, config, seed }, &features, pair);
         graph.want(job);
         jobs.push(job);
     }

@@ -12,7 +12,8 @@ use setloc_sfm::{
     sharpen_lengths,
 };
 
-use super::model::{features_role, image_of_place_holder, read_unchanged};
+use super::features::{features_role, read_unchanged};
+use super::model::image_of_place_holder;
 use super::positions::Measurements;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;

@@ -10,8 +10,8 @@ use setloc_features::ImageFeatures;
 use setloc_index::IndexParams;
 use setloc_sfm::MapperOutput;
 
+use super::features::features_role;
 use super::locate::{EmptyScene, LocateJobs, SetJobs, main_of, query, single_role};
-use super::model::features_role;
 use super::scene::KEPT_FEATURES;
 use crate::codec::{self, Artifact};
 use crate::config::Config;

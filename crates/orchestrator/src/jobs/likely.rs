@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde_json::json;
 use setloc_features::{Camera, ImageFeatures, without_carried};
 
-use super::model::{add_features_of, features_role};
+use super::features::{add_features_of, features_role};
 use crate::artifacts::LikelyImages;
 use crate::config::Config;
 use crate::dataset::SourceImage;

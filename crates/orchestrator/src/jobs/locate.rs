@@ -11,7 +11,8 @@ use setloc_features::{Camera, ImageFeatures};
 use setloc_index::SceneIndex;
 use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
 
-use super::model::{ModelJobs, ModelKind, ModelSource, add_model, features_role};
+use super::features::features_role;
+use super::model::{ModelJobs, ModelKind, ModelSource, add_model};
 use super::pixels::PicturesAtHand;
 use super::{choose_pairs, derived_seed};
 use crate::config::Config;

@@ -1,24 +1,22 @@
-//! Features, matches, verification and mapping of a list of images: for scenes and for local models.
+//! Mapping of a list of images, from their files: for scenes and for local models.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 use std::sync::Arc;
 
-use anyhow::{Context, Result};
-use nalgebra::Vector2;
-use serde_json::{Value, json};
+use anyhow::Result;
+use serde_json::json;
 use setloc_features::{Calibration, Camera, ImageFeatures, Match};
-use setloc_sfm::robust::{RansacParams, estimate_turned_camera};
 use setloc_sfm::{
     CameraId, Georegistration, ImageId, InputImage, MapperInput, MapperOutput, MapperParams,
     MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction, TwoViewParams, assess,
-    reconstruct, verify_pair,
+    reconstruct,
 };
 
 use super::alignment::{KnownOfModel, add_alignment};
-use super::derived_seed;
+use super::features::{Looks, add_features_of, features_role};
+use super::matching::{PairSource, add_pair, is_swapped};
 use super::positions::Measurements;
-use crate::artifacts::{PairMatches, TurnedPair, VerifiedPair};
+use crate::artifacts::{PairMatches, VerifiedPair};
 use crate::config::Config;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
@@ -75,7 +73,7 @@ pub fn add_model(
     };
     let mut pairs = Vec::new();
     for &(a, b) in chosen {
-        pairs.push((a, b, add_pair(graph, images, &looks, (a, b), config, seed)));
+        pairs.push((a, b, add_pair(graph, PairSource { images, config, seed }, &looks, (a, b))));
     }
     let features = looks.last;
     let cameras = share_cameras(images);
@@ -129,290 +127,12 @@ pub fn add_model(
     Ok(ModelJobs { features, model, measured })
 }
 
-/// The features jobs of some images.
-struct Looks {
-    /// Without the views that a second look simulates.
-    first: Vec<JobId>,
-    /// With them, where there is one; else the same.
-    last: Vec<JobId>,
-}
-
-impl Looks {
-    fn once(features: Vec<JobId>) -> Self {
-        Self { first: features.clone(), last: features }
-    }
-
-    /// Adds decoding and extraction of the images of a scene, and what a second look adds to those that are due one.
-    fn add(graph: &mut JobGraph<'_>, images: &[SourceImage], config: &Config) -> Self {
-        let second = config.second_features();
-        let mut looks = Self::once(add_features_of(graph, images, &config.features));
-        for (image, last) in images.iter().zip(&mut looks.last).filter(|(image, _)| image.second_look) {
-            // Views that the first look has simulated are not those of the second.
-            let beside = (config.features.simulated_tilt <= 1.0).then_some(*last);
-            *last = add_features(graph, image, &second, beside);
-        }
-        looks
-    }
-
-    fn is_again(&self, at: usize) -> bool {
-        self.first[at] != self.last[at]
-    }
-}
-
-/// Adds decoding and extraction of each image.
-pub fn add_features_of(
-    graph: &mut JobGraph<'_>,
-    images: &[SourceImage],
-    params: &stages::FeatureParams,
-) -> Vec<JobId> {
-    images.iter().map(|image| add_features(graph, image, params, None)).collect()
-}
-
-pub(super) fn features_role(at: usize) -> String {
-    format!("features {at:04}")
-}
-
 fn pair_role(a: usize, b: usize) -> String {
     format!("pair {a:04} {b:04}")
 }
 
 fn matches_role(a: usize, b: usize) -> String {
     format!("matches {a:04} {b:04}")
-}
-
-/// Pair jobs go by content, not by order of names, so that renaming an image changes nothing.
-fn is_swapped(images: &[SourceImage], a: usize, b: usize) -> bool {
-    images[b].hash < images[a].hash
-}
-
-/// Adds decoding and extraction of an image, `beside` a job that has extracted all but simulated views.
-fn add_features(
-    graph: &mut JobGraph<'_>,
-    image: &SourceImage,
-    features: &stages::FeatureParams,
-    beside: Option<JobId>,
-) -> JobId {
-    let mut external = BTreeMap::from([("image".to_owned(), image.hash)]);
-    let mask = image.mask.clone();
-    if let Some((_, hash)) = &mask {
-        external.insert("mask".to_owned(), *hash);
-    }
-    // A photo's features do not depend on its intrinsics, which may be estimated later.
-    let camera = if image.camera.is_panoramic() {
-        image.camera.clone()
-    } else {
-        Camera::from_focal_guess(image.camera.width, image.camera.height, image.camera.width.into())
-    };
-    // Decoded pixels and three layers of the enlarged image with their smaller octaves, two bytes a pixel, and what passes through.
-    let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 32;
-    let mut params = json!({ "features": features, "camera": camera });
-    if beside.is_some() {
-        params["beside"] = json!("own");
-    }
-    let (path, hash, features) = (image.path.clone(), image.hash, features.clone());
-    let work = move |inputs: &Inputs<'_, '_>| {
-        let own = inputs.find::<ImageFeatures>("own")?;
-        if let Some(own) = own.as_deref().filter(|own| !features.adds_views_to(own)) {
-            return Product::new(own.clone());
-        }
-        let bytes = read_unchanged(&path, hash)?;
-        let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
-        let mask = mask.as_ref().map(|(path, hash)| read_mask(path, *hash)).transpose()?;
-        let mask = mask.as_ref();
-        Product::new(match own {
-            Some(own) => stages::extract_simulated_views(&features, &decoded, &camera, mask, &own)?,
-            None => stages::extract(&features, &decoded, &camera, mask)?,
-        })
-    };
-    let (kind, version, name) = ("features", stages::FEATURES_VERSION, image.name.clone());
-    let job = graph.add(Job { kind, version, name, params, external, memory, work: Box::new(work) });
-    if let Some(own) = beside {
-        graph.require(job, "own", own);
-    }
-    job
-}
-
-fn read_mask(path: &Path, hash: ContentHash) -> Result<stages::Mask> {
-    let bytes = read_unchanged(path, hash)?;
-    stages::Mask::decode(&bytes, &stages::DecodeLimits::default())
-        .with_context(|| format!("mask {}", path.display()))
-}
-
-/// The bytes that were hashed when the run was planned.
-pub(super) fn read_unchanged(path: &Path, hash: ContentHash) -> Result<Vec<u8>> {
-    let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    anyhow::ensure!(ContentHash::of(&bytes) == hash, "{} changed while it was used", path.display());
-    Ok(bytes)
-}
-
-/// The jobs of one pair.
-#[derive(Clone, Copy)]
-struct PairJobs {
-    matches: JobId,
-    verified: JobId,
-}
-
-/// Adds matching and verification of one pair.
-fn add_pair(
-    graph: &mut JobGraph<'_>,
-    images: &[SourceImage],
-    looks: &Looks,
-    (a, b): (usize, usize),
-    config: &Config,
-    seed: u64,
-) -> PairJobs {
-    let mut matches = add_matches(graph, images, &looks.first, (a, b), config);
-    if looks.is_again(a) || looks.is_again(b) {
-        matches = add_matches_of_views(graph, images, looks, (a, b), matches, config);
-    }
-    let (a, b) = in_order(images, (a, b));
-    let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
-    let seed = pair_seed(images, (a, b), seed);
-    let (two_view, cameras) = (config.two_view.clone(), [images[a].camera.clone(), images[b].camera.clone()]);
-    let params = json!({ "two_view": two_view, "cameras": cameras, "seed": seed });
-    let work = move |inputs: &Inputs<'_, '_>| {
-        let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
-        let matches = inputs.get::<PairMatches>("matches")?;
-        // Far fewer are matched than found, and a ray takes longer than what verification does with it.
-        let first = first.rays_of(&cameras[0], matches.0.iter().map(|m| m.first));
-        let second = second.rays_of(&cameras[1], matches.0.iter().map(|m| m.second));
-        Product::new(VerifiedPair(verify_pair(&two_view, posture, &first, &second, &matches.0, seed)))
-    };
-    let job = pair_job(images, (a, b), ("verify", stages::VERIFY_VERSION), params, work);
-    let verified = add_pair_job(graph, job, &looks.last, (a, b));
-    graph.require(verified, "matches", matches);
-    PairJobs { matches, verified }
-}
-
-/// Two images in the order of their jobs' matches.
-fn in_order(images: &[SourceImage], (a, b): (usize, usize)) -> (usize, usize) {
-    if is_swapped(images, a, b) { (b, a) } else { (a, b) }
-}
-
-fn pair_seed(images: &[SourceImage], (a, b): (usize, usize), seed: u64) -> u64 {
-    derived_seed(seed, &[&images[a].hash.to_string(), &images[b].hash.to_string()])
-}
-
-/// A job about two images.
-fn pair_job<'a>(
-    images: &[SourceImage],
-    (a, b): (usize, usize),
-    (kind, version): (&'static str, u32),
-    params: Value,
-    work: impl Fn(&Inputs<'_, '_>) -> Result<Product> + Send + Sync + 'a,
-) -> Job<'a> {
-    let name = [&images[a].name, &images[b].name];
-    let name = format!("{} {}", name[0].min(name[1]), name[0].max(name[1]));
-    Job { kind, version, name, params, external: BTreeMap::new(), memory: 8 << 20, work: Box::new(work) }
-}
-
-/// Adds a job that uses the features of two images.
-fn add_pair_job<'a>(
-    graph: &mut JobGraph<'a>,
-    job: Job<'a>,
-    features: &[JobId],
-    (a, b): (usize, usize),
-) -> JobId {
-    let job = graph.add(job);
-    graph.require(job, "first", features[a]);
-    graph.require(job, "second", features[b]);
-    job
-}
-
-/// Adds matching of one pair.
-fn add_matches(
-    graph: &mut JobGraph<'_>,
-    images: &[SourceImage],
-    features: &[JobId],
-    pair: (usize, usize),
-    config: &Config,
-) -> JobId {
-    let (a, b) = in_order(images, pair);
-    let matching = config.matching.clone();
-    let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
-    let params = json!({ "matching": config.matching, "posture": posture });
-    let work = move |inputs: &Inputs<'_, '_>| {
-        let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
-        Product::new(PairMatches(stages::match_features(&matching, posture, &first, &second)))
-    };
-    let job = pair_job(images, (a, b), ("matches", stages::MATCHING_VERSION), params, work);
-    add_pair_job(graph, job, features, (a, b))
-}
-
-/// Adds to the matches of one pair those of the views that a second look simulates of either.
-fn add_matches_of_views(
-    graph: &mut JobGraph<'_>,
-    images: &[SourceImage],
-    looks: &Looks,
-    pair: (usize, usize),
-    own: JobId,
-    config: &Config,
-) -> JobId {
-    let (a, b) = in_order(images, pair);
-    let matching = config.matching.clone();
-    let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
-    let params = json!({ "matching": config.matching, "posture": posture, "beside": "own" });
-    let work = move |inputs: &Inputs<'_, '_>| {
-        let features = |role: &str| inputs.get::<ImageFeatures>(role);
-        let (first, second) = (features("first")?, features("second")?);
-        let had_views =
-            !features("first alone")?.simulated.is_empty() || !features("second alone")?.simulated.is_empty();
-        Product::new(PairMatches(if had_views {
-            // Those of faint images are among what has been matched.
-            stages::match_features(&matching, posture, &first, &second)
-        } else {
-            let own = inputs.get::<PairMatches>("own")?;
-            stages::match_simulated_views(&matching, posture, &first, &second, &own.0)
-        }))
-    };
-    let job = pair_job(images, (a, b), ("matches", stages::MATCHING_VERSION), params, work);
-    let job = add_pair_job(graph, job, &looks.last, (a, b));
-    graph.require(job, "own", own);
-    graph.require(job, "first alone", looks.first[a]);
-    graph.require(job, "second alone", looks.first[b]);
-    job
-}
-
-/// Pixels of a pair that are compared to tell a focal length by a turn, as shares of the longer side: deviation, and the range of
-/// focal lengths.
-const TURN_NOISE: f64 = 0.001;
-const TURN_FOCAL: (f64, f64) = (0.3, 5.0);
-/// Fewest matches that tell a focal length by a turn.
-const MIN_TURNED: usize = 30;
-
-/// Adds the jobs that tell the focal length of the camera of two images by its turn on the spot.
-pub fn add_turned(
-    graph: &mut JobGraph<'_>,
-    images: &[SourceImage],
-    features: &[JobId],
-    (a, b): (usize, usize),
-    config: &Config,
-    seed: u64,
-) -> JobId {
-    let matches = add_matches(graph, images, features, (a, b), config);
-    let (a, b) = in_order(images, (a, b));
-    let seed = pair_seed(images, (a, b), seed);
-    let [width, height] = [images[a].camera.width, images[a].camera.height].map(f64::from);
-    let params = json!({ "size": [width, height], "seed": seed });
-    let work = move |inputs: &Inputs<'_, '_>| {
-        let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
-        let matches = inputs.get::<PairMatches>("matches")?;
-        let middle = Vector2::new(width, height) / 2.0;
-        let pixel = |of: &ImageFeatures, at: u32| Some(of.keypoints.get(at as usize)?.pixel() - middle);
-        let pixels =
-            matches.0.iter().filter_map(|m| Some((pixel(&first, m.first)?, pixel(&second, m.second)?)));
-        let (first, second): (Vec<_>, Vec<_>) = pixels.unzip();
-        let params =
-            RansacParams { max_iterations: 1000, min_inliers: MIN_TURNED, ..RansacParams::default() };
-        let side = width.max(height);
-        let range = (TURN_FOCAL.0 * side, TURN_FOCAL.1 * side);
-        let turned = estimate_turned_camera(&params, &first, &second, TURN_NOISE * side, range, seed);
-        Product::new(TurnedPair(turned))
-    };
-    let job = pair_job(images, (a, b), ("turned", stages::TURNED_VERSION), params, work);
-    let turned = add_pair_job(graph, job, features, (a, b));
-    graph.require(turned, "matches", matches);
-    turned
 }
 
 /// Cameras shared by the images that have the same one.

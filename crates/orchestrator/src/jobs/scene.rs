@@ -12,9 +12,8 @@ use setloc_sfm::{
 
 use super::accuracy::{Accuracy, first_of};
 use super::choose_pairs;
-use super::model::{
-    ModelJobs, ModelKind, ModelSource, add_model, features_role, image_of_place_holder, with_names,
-};
+use super::features::features_role;
+use super::model::{ModelJobs, ModelKind, ModelSource, add_model, image_of_place_holder, with_names};
 use super::positions::{self, Fix};
 use crate::artifacts::{LeftApart, SceneIndices};
 use crate::codec::Artifact;

@@ -1,0 +1,117 @@
+//! Features of images: of scenes, which may look at some of them twice, and of photos.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use serde_json::json;
+use setloc_features::{Camera, ImageFeatures};
+
+use crate::config::Config;
+use crate::dataset::SourceImage;
+use crate::fingerprint::ContentHash;
+use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
+use crate::stages;
+
+/// The features jobs of some images.
+pub(super) struct Looks {
+    /// Without the views that a second look simulates.
+    pub first: Vec<JobId>,
+    /// With them, where there is one; else the same.
+    pub last: Vec<JobId>,
+}
+
+impl Looks {
+    pub fn once(features: Vec<JobId>) -> Self {
+        Self { first: features.clone(), last: features }
+    }
+
+    /// Adds decoding and extraction of the images of a scene, and what a second look adds to those that are due one.
+    pub fn add(graph: &mut JobGraph<'_>, images: &[SourceImage], config: &Config) -> Self {
+        let second = config.second_features();
+        let mut looks = Self::once(add_features_of(graph, images, &config.features));
+        for (image, last) in images.iter().zip(&mut looks.last).filter(|(image, _)| image.second_look) {
+            // Views that the first look has simulated are not those of the second.
+            let beside = (config.features.simulated_tilt <= 1.0).then_some(*last);
+            *last = add_features(graph, image, &second, beside);
+        }
+        looks
+    }
+
+    pub fn is_again(&self, at: usize) -> bool {
+        self.first[at] != self.last[at]
+    }
+}
+
+/// Adds decoding and extraction of each image.
+pub fn add_features_of(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    params: &stages::FeatureParams,
+) -> Vec<JobId> {
+    images.iter().map(|image| add_features(graph, image, params, None)).collect()
+}
+
+pub(super) fn features_role(at: usize) -> String {
+    format!("features {at:04}")
+}
+
+/// Adds decoding and extraction of an image, `beside` a job that has extracted all but simulated views.
+fn add_features(
+    graph: &mut JobGraph<'_>,
+    image: &SourceImage,
+    features: &stages::FeatureParams,
+    beside: Option<JobId>,
+) -> JobId {
+    let mut external = BTreeMap::from([("image".to_owned(), image.hash)]);
+    let mask = image.mask.clone();
+    if let Some((_, hash)) = &mask {
+        external.insert("mask".to_owned(), *hash);
+    }
+    // A photo's features do not depend on its intrinsics, which may be estimated later.
+    let camera = if image.camera.is_panoramic() {
+        image.camera.clone()
+    } else {
+        Camera::from_focal_guess(image.camera.width, image.camera.height, image.camera.width.into())
+    };
+    // Decoded pixels and three layers of the enlarged image with their smaller octaves, two bytes a pixel, and what passes through.
+    let memory = u64::from(image.camera.width) * u64::from(image.camera.height) * 32;
+    let mut params = json!({ "features": features, "camera": camera });
+    if beside.is_some() {
+        params["beside"] = json!("own");
+    }
+    let (path, hash, features) = (image.path.clone(), image.hash, features.clone());
+    let work = move |inputs: &Inputs<'_, '_>| {
+        let own = inputs.find::<ImageFeatures>("own")?;
+        if let Some(own) = own.as_deref().filter(|own| !features.adds_views_to(own)) {
+            return Product::new(own.clone());
+        }
+        let bytes = read_unchanged(&path, hash)?;
+        let decoded = stages::decode(&bytes, &stages::DecodeLimits::default())?;
+        let mask = mask.as_ref().map(|(path, hash)| read_mask(path, *hash)).transpose()?;
+        let mask = mask.as_ref();
+        Product::new(match own {
+            Some(own) => stages::extract_simulated_views(&features, &decoded, &camera, mask, &own)?,
+            None => stages::extract(&features, &decoded, &camera, mask)?,
+        })
+    };
+    let (kind, version, name) = ("features", stages::FEATURES_VERSION, image.name.clone());
+    let job = graph.add(Job { kind, version, name, params, external, memory, work: Box::new(work) });
+    if let Some(own) = beside {
+        graph.require(job, "own", own);
+    }
+    job
+}
+
+fn read_mask(path: &Path, hash: ContentHash) -> Result<stages::Mask> {
+    let bytes = read_unchanged(path, hash)?;
+    stages::Mask::decode(&bytes, &stages::DecodeLimits::default())
+        .with_context(|| format!("mask {}", path.display()))
+}
+
+/// The bytes that were hashed when the run was planned.
+pub(super) fn read_unchanged(path: &Path, hash: ContentHash) -> Result<Vec<u8>> {
+    let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    anyhow::ensure!(ContentHash::of(&bytes) == hash, "{} changed while it was used", path.display());
+    Ok(bytes)
+}
