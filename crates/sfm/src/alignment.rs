@@ -37,6 +37,7 @@ use crate::{
 /// By how much a panorama's stretch and twist differ from what all of one camera share, as a deviation of each term: 0.0002–0.0008
 /// in four real places.
 pub(crate) const STITCHING_OF_EACH: f64 = 0.0005;
+
 /// Bumped when equal inputs and parameters give another result.
 pub const ALIGNMENT_VERSION: u32 = 24;
 
@@ -586,10 +587,11 @@ impl<'a> Tracks<'a> {
             users[component.images[image.index()].camera.index()].push(image);
         }
         for (camera, freedom) in problem.camera_freedom.iter_mut().enumerate() {
-            let is_told = || {
-                component.cameras[camera].is_stretched()
-                    || users[camera].len() >= 2
-                    || component.tells_camera_of(&users[camera])
+            let is_told = || match &users[camera][..] {
+                [] => false,
+                [_] if component.cameras[camera].is_stretched() => true,
+                [one] => component.tells_camera_of(&[*one]),
+                _ => true,
             };
             if camera_fixed.get(camera) != Some(&true) && is_told() {
                 *freedom = IntrinsicsFreedom::FREE;
