@@ -16,6 +16,8 @@ use crate::refine::place_on;
 
 /// Standard deviation of the terms that turn with the photo's heading. Panoramas of consumer cameras stretch by 0.2–0.6 %.
 const SIGMA: f64 = 0.003;
+/// Of the twist, which within a photo hardly differs from a turn of it: by as much as one panorama's differs from another's.
+const TWIST_SIGMA: f64 = 0.0005;
 /// Share of the cost that stretches must spare to be believed: true intrinsics of four rendered sets spare at most 0.8 %, those of
 /// photos cut from panoramas of three real places mostly 4–16 %.
 const LEAST_SPARED: f64 = 0.02;
@@ -105,8 +107,10 @@ impl Freed {
 fn prior(at: usize, stitched: &Camera) -> Option<CameraPrior> {
     let mut prior = CameraPrior::of_usual_photo(at as u32, stitched)?;
     for (known, name) in prior.parameters.iter_mut().zip(stitched.model.param_names()) {
-        if matches!(*name, "xx" | "xz") {
-            known.sigma = SIGMA;
+        match *name {
+            "xx" | "xz" => known.sigma = SIGMA,
+            "txx" | "txy" | "txz" | "tyz" | "tyy" => known.sigma = TWIST_SIGMA,
+            _ => {}
         }
     }
     Some(prior)
