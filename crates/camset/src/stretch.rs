@@ -7,17 +7,17 @@
 //! 0.3 %, without a residual that stands out. All photos of a set together tell.
 
 use nalgebra::{UnitQuaternion, Vector2};
-use setloc_features::{Camera, ParamRole};
+use setloc_features::Camera;
 use setloc_sfm::Place;
 use setloc_sfm::bundle::{BundleProblem, CameraPrior, IntrinsicsFreedom};
 
 use crate::Scene;
 use crate::refine::place_on;
 
+/// Terms of a stretch.
+const TERMS: usize = 4;
 /// Standard deviation of the terms that turn with the photo's heading. Panoramas of consumer cameras stretch by 0.2–0.6 %.
 const SIGMA: f64 = 0.003;
-/// Of the twist, which within a photo hardly differs from a turn of it: by as much as one panorama's differs from another's.
-const TWIST_SIGMA: f64 = 0.0005;
 /// Share of the cost that stretches must spare to be believed: true intrinsics of four rendered sets spare at most 0.8 %, those of
 /// photos cut from panoramas of three real places mostly 4–16 %.
 const LEAST_SPARED: f64 = 0.02;
@@ -50,7 +50,7 @@ impl PhotoStretch {
     /// Whether these stretches spare more than noise would.
     pub fn is_worth(&self, freed: &Freed, as_told: f64, stretched: f64) -> bool {
         let spared = as_told - stretched;
-        let parameters = freed.terms * freed.cameras.len();
+        let parameters = TERMS * freed.cameras.len();
         let enough = if self.is_likely { 0.0 } else { LEAST_PER_PARAMETER * parameters as f64 };
         spared > LEAST_SPARED * as_told && spared > enough
     }
@@ -67,8 +67,6 @@ impl PhotoStretch {
 #[derive(Debug, Default)]
 pub(crate) struct Freed {
     cameras: Vec<usize>,
-    /// Parameters that are estimated of each.
-    terms: usize,
 }
 
 impl Freed {
@@ -76,7 +74,6 @@ impl Freed {
     pub fn new(problem: &mut BundleProblem, sphere: &Camera, poses: &[usize]) -> Self {
         let (mut freed, mut told) = (Self::default(), vec![None; problem.poses.len()]);
         let Some(stitched) = sphere.as_stitched() else { return freed };
-        freed.terms = stitched.param_roles().iter().filter(|role| **role == ParamRole::Stretch).count();
         problem.camera_freedom.resize(problem.cameras.len(), IntrinsicsFreedom::FIXED);
         for &pose in poses {
             let at = problem.cameras.len();
@@ -107,10 +104,8 @@ impl Freed {
 fn prior(at: usize, stitched: &Camera) -> Option<CameraPrior> {
     let mut prior = CameraPrior::of_usual_photo(at as u32, stitched)?;
     for (known, name) in prior.parameters.iter_mut().zip(stitched.model.param_names()) {
-        match *name {
-            "xx" | "xz" => known.sigma = SIGMA,
-            "txx" | "txy" | "txz" | "tyz" | "tyy" => known.sigma = TWIST_SIGMA,
-            _ => {}
+        if matches!(*name, "xx" | "xz") {
+            known.sigma = SIGMA;
         }
     }
     Some(prior)
@@ -169,7 +164,7 @@ mod tests {
 
     #[test]
     fn noise_is_not_worth_a_stretch_that_nothing_else_speaks_for() {
-        let freed = Freed { cameras: vec![3, 4], terms: 4 };
+        let freed = Freed { cameras: vec![3, 4] };
         let (unlikely, likely) =
             (PhotoStretch::default(), PhotoStretch { is_likely: true, ..PhotoStretch::default() });
         for stretch in [unlikely, likely] {
