@@ -187,6 +187,11 @@ fn extract_beside(
             height: camera.height,
         });
     }
+    if let Some(own) = known
+        && !params.adds_views_to(own)
+    {
+        return Ok(own.clone());
+    }
     let padding = if camera.wraps_around() { width as usize / SEAM_SHARE } else { 0 };
     let reduction = (f64::from(params.max_side) / f64::from(width.max(height))).min(1.0);
     let whole = GreyImage::from(image).wrapped(padding);
@@ -213,11 +218,6 @@ fn extract_beside(
         (features, usual < params.min_features.min(params.max_features))
     };
     let tilt = if is_faint { params.simulated_tilt.max(params.faint_tilt) } else { params.simulated_tilt };
-    if let Some(own) = known
-        && !params.adds_views_to(own)
-    {
-        return Ok(own.clone());
-    }
     if tilt > 1.0 {
         for tilt in [[tilt, 1.0], [1.0, tilt]] {
             let pixels = enlargement.powi(2) * grey.values.len() as f64 / (tilt[0] * tilt[1]);

@@ -17,6 +17,9 @@ const ROOM: [f64; 3] = [5.0, 3.0, 4.0];
 /// Standard deviation of the keypoints in pixels.
 const NOISE_PX: f64 = 0.4;
 
+/// The room's one camera is known.
+const ALL_CAMERAS: KnownOfComponent<'static> = KnownOfComponent { cameras: &[true], positions: None };
+
 /// A room, panoramas of it turned any way, and what a mapper would have made of noisy keypoints.
 struct Room {
     truth: Vec<Rigid>,
@@ -118,14 +121,7 @@ impl Room {
     fn align(&self, params: &AlignmentParams) -> (Reconstruction, AlignmentReport) {
         let (mut model, features) = (self.model.clone(), self.features.iter().collect::<Vec<_>>());
         let load = |image: ImageId| Ok::<_, Infallible>(Arc::clone(&self.pyramids[image.index()]));
-        let report = align_tracks(
-            params,
-            &mut model,
-            &features,
-            KnownOfComponent { cameras: &[true], positions: None },
-            load,
-        )
-        .unwrap();
+        let report = align_tracks(params, &mut model, &features, ALL_CAMERAS, load).unwrap();
         (model, report)
     }
 
@@ -205,13 +201,7 @@ fn unreadable_images_leave_the_model_alone() {
     let features: Vec<&ImageFeatures> = room.features.iter().collect();
     let mut model = room.model.clone();
     let load = |image: ImageId| if image.0 == 2 { Err("gone") } else { Ok(Arc::clone(&room.pyramids[0])) };
-    let failed = align_tracks(
-        &AlignmentParams::default(),
-        &mut model,
-        &features,
-        KnownOfComponent { cameras: &[true], positions: None },
-        load,
-    );
+    let failed = align_tracks(&AlignmentParams::default(), &mut model, &features, ALL_CAMERAS, load);
     assert_eq!((failed, &model), (Err("gone"), &room.model));
 }
 
