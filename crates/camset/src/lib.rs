@@ -73,8 +73,8 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// noise of right ones. 38: photos that are stretched. 39: pictures of walls by the luma that JPEGs store.
 /// 40: what the scene's poses may be off. 41: an adjustment's steps are stretched by its curvature. 42: scene points of uncertain
 /// depth are held by parallax. 43: points of a grown scene shift to where moved rays meet. 44: stretched photos go on from where they
-/// are refined to.
-pub const VERSION: u32 = 44;
+/// are refined to. 45: and are twisted. 46: as the scene's panoramas are. 47: scales that few matches give.
+pub const VERSION: u32 = 47;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 /// 2: points shift to where moved rays meet.

@@ -85,7 +85,7 @@ fn adjust(
     }
     let problem = &mut joint.problem;
     if model.stretch.is_free {
-        let freed = Freed::new(problem, &standpoints.sphere, &slots);
+        let freed = Freed::new(problem, &standpoints.sphere, &slots, model.stretch.twist_sigma);
         bundle::solve(params, problem);
         model.stretch.note(problem, &freed);
         return;
@@ -93,7 +93,7 @@ fn adjust(
     let as_told = bundle::solve(params, problem);
     if may_stretch && !slots.is_empty() {
         let mut stretched = problem.clone();
-        let freed = Freed::new(&mut stretched, &standpoints.sphere, &slots);
+        let freed = Freed::new(&mut stretched, &standpoints.sphere, &slots, model.stretch.twist_sigma);
         let report = bundle::solve(params, &mut stretched);
         if model.stretch.is_worth(&freed, as_told.final_cost, report.final_cost) {
             *problem = stretched;

@@ -78,6 +78,8 @@ struct Answer {
     remarks: Vec<Remark>,
     /// Whether each photo, localized alone, stands elsewhere.
     elsewhere: Vec<bool>,
+    /// Whether where each photo is rests on a scale that too few matches give.
+    lacks_scale: Vec<bool>,
     /// What holds each photo: the scene points that it and the photos placed with it see, by photo.
     seen: Vec<Vec<(usize, usize)>>,
 }
@@ -109,8 +111,8 @@ impl Answer {
     }
 }
 
-/// The second answer, which knows more, where anything is localized better in it, but for photos that the first localizes
-/// better; the first altogether where they contradict each other.
+/// The second answer, which knows more, where anything is localized better in it or has a scale that the first lacks, but for
+/// photos of which that holds the other way round; the first altogether where they contradict each other.
 fn better_of(first: Answer, second: Answer) -> Answer {
     let pairs = || first.set.refined.iter().zip(&second.set.refined);
     let is_localized = |photo: &PhotoLocalization| photo.verdict == Verdict::Localized;
@@ -122,21 +124,24 @@ fn better_of(first: Answer, second: Answer) -> Answer {
         let apart = (of_a.translation - of_b.translation).norm();
         is_localized(a) && is_localized(b) && apart > MAX_APART * sigma(a).hypot(sigma(b))
     };
-    let gains = pairs().any(|(a, b)| b.verdict.rank() > a.verdict.rank());
+    let worth = |answer: &Answer, at: usize| {
+        let photo = &answer.set.refined[at];
+        (photo.verdict.rank(), photo.world_from_camera.is_some() && !answer.lacks_scale[at])
+    };
+    let gains = (0..pairs().len()).any(|at| worth(&second, at) > worth(&first, at));
     if !gains || pairs().any(contradicts) {
         return first;
     }
+    let is_better: Vec<bool> = (0..pairs().len()).map(|at| worth(&first, at) > worth(&second, at)).collect();
     let mut best = second;
-    let Answer { set: first, elsewhere, seen, .. } = first;
-    for (at, refined) in first.refined.into_iter().enumerate() {
-        if refined.verdict.rank() > best.set.refined[at].verdict.rank() {
-            best.set.refined[at] = refined;
-            best.set.paths[at] = first.paths[at].clone();
-            best.elsewhere[at] = elsewhere[at];
-            best.seen[at].clone_from(&seen[at]);
-        }
+    for at in (0..is_better.len()).filter(|&at| is_better[at]) {
+        best.set.refined[at].clone_from(&first.set.refined[at]);
+        best.set.paths[at].clone_from(&first.set.paths[at]);
+        best.elsewhere[at] = first.elsewhere[at];
+        best.lacks_scale[at] = first.lacks_scale[at];
+        best.seen[at].clone_from(&first.seen[at]);
     }
-    for (kept, rigid) in best.set.rigid.iter_mut().zip(first.rigid) {
+    for (kept, rigid) in best.set.rigid.iter_mut().zip(first.set.rigid) {
         if rigid.verdict.rank() > kept.verdict.rank() {
             *kept = rigid;
         }
@@ -157,6 +162,7 @@ fn locate_by(
 ) -> Answer {
     let (mut answer, mut remarks) = (SetLocalization::default(), Vec::new());
     let mut elsewhere = vec![false; photos.len()];
+    let mut lacks_scale = vec![false; photos.len()];
     let mut seen: Vec<_> = evidence.iter().enumerate().map(|(at, e)| vec![(at, e.photo.inliers)]).collect();
     let mut rigid: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut refined: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
@@ -195,6 +201,7 @@ fn locate_by(
                     keep_better(&mut rigid[photo], found.rigid[slot].clone());
                     if keep_better(&mut refined[photo], found.refined[slot].clone()) {
                         elsewhere[photo] = found.elsewhere[slot];
+                        lacks_scale[photo] = found.lacks_scale;
                         seen[photo].clone_from(&seen_by_all);
                     }
                 }
@@ -227,7 +234,7 @@ fn locate_by(
             photo.reasons.push(format!("its weakest link to the scene shares {} points only", link.shared));
         }
     }
-    Answer { set: answer, remarks, elsewhere, seen }
+    Answer { set: answer, remarks, elsewhere, lacks_scale, seen }
 }
 
 /// Whether each photo of a local model is localized alone, at the place that the model gives it.
@@ -753,9 +760,8 @@ mod tests {
         }
     }
 
-    #[test]
-    fn answers_that_contradict_each_other_are_not_mixed() {
-        let photo = |verdict, x: f64| PhotoLocalization {
+    fn photo_at(verdict: Verdict, x: f64) -> PhotoLocalization {
+        PhotoLocalization {
             name: String::new(),
             camera: crate::synthetic::pinhole(),
             component: 0,
@@ -764,37 +770,59 @@ mod tests {
             inliers: 20,
             verdict,
             reasons: Vec::new(),
-        };
+        }
+    }
+
+    /// An answer of two photos whose model was refused before.
+    fn answer_of(photos: &[PhotoLocalization; 2]) -> Answer {
         let path = |shared| PathToScene {
             photo: "photo".to_owned(),
             links: vec![Link { from: None, to: "photo".to_owned(), shared }],
             open: None,
         };
-        let answer = |photos: Vec<PhotoLocalization>| Answer {
-            elsewhere: vec![false; photos.len()],
-            seen: vec![Vec::new(); photos.len()],
+        Answer {
+            elsewhere: vec![false; 2],
+            lacks_scale: vec![false; 2],
+            seen: vec![Vec::new(); 2],
             remarks: vec![Remark { members: vec![0, 1], is_refusal: true, text: "refused".to_owned() }],
             set: SetLocalization {
-                rigid: photos.clone(),
+                rigid: photos.to_vec(),
                 paths: vec![path(photos[0].inliers), path(photos[1].inliers)],
-                refined: photos,
+                refined: photos.to_vec(),
                 ..SetLocalization::default()
             },
-        };
+        }
+    }
+
+    #[test]
+    fn answers_that_contradict_each_other_are_not_mixed() {
+        let (photo, answer) = (photo_at, answer_of);
         let verdicts =
             |found: &Answer| found.set.refined.iter().map(|photo| photo.verdict).collect::<Vec<_>>();
-        let first = || answer(vec![photo(Verdict::Localized, 0.0), photo(Verdict::Uncertain, 1.0)]);
-        let agreeing = answer(vec![photo(Verdict::Uncertain, 0.01), photo(Verdict::Localized, 1.01)]);
+        let first = || answer(&[photo(Verdict::Localized, 0.0), photo(Verdict::Uncertain, 1.0)]);
+        let agreeing = answer(&[photo(Verdict::Uncertain, 0.01), photo(Verdict::Localized, 1.01)]);
         let best = better_of(first(), agreeing);
         assert_eq!(verdicts(&best), [Verdict::Localized; 2]);
         assert_eq!(best.set.refined[0].world_from_camera, first().set.refined[0].world_from_camera);
         // Neither that the models were refused nor what to do about a photo holds any more.
         assert_eq!(best.finished().advice, Vec::<String>::new());
         assert_eq!(first().finished().advice.len(), 2);
-        let elsewhere = answer(vec![photo(Verdict::Localized, 5.0), photo(Verdict::Localized, 6.0)]);
+        let elsewhere = answer(&[photo(Verdict::Localized, 5.0), photo(Verdict::Localized, 6.0)]);
         assert_eq!(better_of(first(), elsewhere), first());
-        let poorer = answer(vec![photo(Verdict::Uncertain, 0.0), photo(Verdict::NotLocalized, 1.0)]);
+        let poorer = answer(&[photo(Verdict::Uncertain, 0.0), photo(Verdict::NotLocalized, 1.0)]);
         assert_eq!(better_of(first(), poorer), first());
+    }
+
+    #[test]
+    fn of_two_uncertain_answers_the_one_whose_scale_is_told_is_taken() {
+        let photos = |x: f64| [photo_at(Verdict::Localized, 0.0), photo_at(Verdict::Uncertain, x)];
+        let lacking = || Answer { lacks_scale: vec![true, true], ..answer_of(&photos(1.0)) };
+        assert_eq!(better_of(lacking(), answer_of(&photos(1.2))), answer_of(&photos(1.2)));
+        assert_eq!(better_of(answer_of(&photos(1.2)), lacking()), answer_of(&photos(1.2)));
+        assert_eq!(
+            better_of(lacking(), Answer { lacks_scale: vec![true, true], ..answer_of(&photos(1.2)) }),
+            lacking()
+        );
     }
 
     #[test]
@@ -913,6 +941,23 @@ mod tests {
         let found = locate(&world, &CamsetParams::default());
         assert_eq!(found.refined[5].verdict, Verdict::Localized);
         assert_eq!(found.refined[6].verdict, Verdict::Uncertain, "{:#?}", found.refined[6]);
+    }
+
+    #[test]
+    fn a_length_from_fewer_points_than_a_pose_needs_is_not_relied_upon() {
+        let mut world = World::chain(7, 0.2, 44);
+        world.cut_last(0.6, 0.02);
+        world.local.lengths[0].votes = 11;
+        let found = locate(&world, &CamsetParams::default());
+        let [near, target] = [5, 6].map(|photo| &found.refined[photo]);
+        assert_eq!((near.verdict, target.verdict), (Verdict::Localized, Verdict::Uncertain));
+        let said = target.reasons.join("; ");
+        assert!(said.contains("how far it is from photo_05 rests on "), "{said}");
+        let (pose, covariance) = (target.world_from_camera.unwrap(), target.covariance.unwrap());
+        let off = pose.translation - world.photos[6].pose.translation;
+        let of_center = covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        let normalized = off.dot(&(of_center.try_inverse().unwrap() * off)) / 3.0;
+        assert!(off.norm() > 1.0 && normalized < 2.0, "{off} {normalized}");
     }
 
     #[test]

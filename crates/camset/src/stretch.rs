@@ -7,17 +7,20 @@
 //! 0.3 %, without a residual that stands out. All photos of a set together tell.
 
 use nalgebra::{UnitQuaternion, Vector2};
-use setloc_features::Camera;
+use setloc_features::{Camera, ParamRole};
 use setloc_sfm::Place;
 use setloc_sfm::bundle::{BundleProblem, CameraPrior, IntrinsicsFreedom};
 
 use crate::Scene;
 use crate::refine::place_on;
 
-/// Terms of a stretch.
-const TERMS: usize = 4;
 /// Standard deviation of the terms that turn with the photo's heading. Panoramas of consumer cameras stretch by 0.2–0.6 %.
 const SIGMA: f64 = 0.003;
+/// Of the terms of a twist, which within a photo hardly differs from a turn of it, where the scene says nothing: by as much as one
+/// panorama's differs from another's.
+const TWIST_SIGMA: f64 = 0.0005;
+/// And where it says that there is next to none.
+const LEAST_TWIST_SIGMA: f64 = 1e-4;
 /// Share of the cost that stretches must spare to be believed: true intrinsics of four rendered sets spare at most 0.8 %, those of
 /// photos cut from panoramas of three real places mostly 4–16 %.
 const LEAST_SPARED: f64 = 0.02;
@@ -25,21 +28,34 @@ const LEAST_SPARED: f64 = 0.02;
 const LEAST_PER_PARAMETER: f64 = 1.0;
 
 /// Whether photos of known intrinsics may be stretched.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct PhotoStretch {
     /// They may, each standpoint by itself.
     pub is_free: bool,
     /// The scene's own panoramas are: those of one place are mostly of one kind.
     pub is_likely: bool,
+    /// Standard deviation of the terms of their twist.
+    pub twist_sigma: f64,
     /// The largest that was found, as a share.
     pub largest: f64,
+}
+
+impl Default for PhotoStretch {
+    /// Of photos of which neither the scene nor they say anything.
+    fn default() -> Self {
+        Self { is_free: false, is_likely: false, twist_sigma: TWIST_SIGMA, largest: 0.0 }
+    }
 }
 
 impl PhotoStretch {
     /// Of a photo alone, whose residuals hardly tell: it may where that is likely.
     pub fn of_one(scene: &Scene<'_>) -> Self {
-        let is_likely = scene.reconstruction.cameras.iter().any(Camera::is_stretched);
-        Self { is_free: is_likely, is_likely, largest: 0.0 }
+        let stretched = scene.reconstruction.cameras.iter().filter(|camera| camera.is_stretched());
+        let twists: Vec<f64> = stretched.flat_map(|camera| camera.twist().to_vec()).collect();
+        let is_likely = !twists.is_empty();
+        let mean_square = twists.iter().map(|term| term * term).sum::<f64>() / twists.len() as f64;
+        let twist_sigma = if is_likely { mean_square.sqrt().max(LEAST_TWIST_SIGMA) } else { TWIST_SIGMA };
+        Self { is_free: is_likely, is_likely, twist_sigma, largest: 0.0 }
     }
 
     /// Of a set, whose residuals are asked: well calibrated photos are four times as far off where they may be stretched.
@@ -50,7 +66,7 @@ impl PhotoStretch {
     /// Whether these stretches spare more than noise would.
     pub fn is_worth(&self, freed: &Freed, as_told: f64, stretched: f64) -> bool {
         let spared = as_told - stretched;
-        let parameters = TERMS * freed.cameras.len();
+        let parameters = freed.terms * freed.cameras.len();
         let enough = if self.is_likely { 0.0 } else { LEAST_PER_PARAMETER * parameters as f64 };
         spared > LEAST_SPARED * as_told && spared > enough
     }
@@ -67,18 +83,21 @@ impl PhotoStretch {
 #[derive(Debug, Default)]
 pub(crate) struct Freed {
     cameras: Vec<usize>,
+    /// Parameters that are estimated of each.
+    terms: usize,
 }
 
 impl Freed {
     /// Gives each of these poses a camera of its own that sees all around and may be stretched; what they saw they see there.
-    pub fn new(problem: &mut BundleProblem, sphere: &Camera, poses: &[usize]) -> Self {
+    pub fn new(problem: &mut BundleProblem, sphere: &Camera, poses: &[usize], twist_sigma: f64) -> Self {
         let (mut freed, mut told) = (Self::default(), vec![None; problem.poses.len()]);
         let Some(stitched) = sphere.as_stitched() else { return freed };
+        freed.terms = stitched.param_roles().iter().filter(|role| **role == ParamRole::Stretch).count();
         problem.camera_freedom.resize(problem.cameras.len(), IntrinsicsFreedom::FIXED);
         for &pose in poses {
             let at = problem.cameras.len();
             told[pose] = Some(std::mem::replace(&mut problem.poses[pose].camera, at as u32) as usize);
-            problem.camera_priors.extend(prior(at, &stitched));
+            problem.camera_priors.extend(prior(at, &stitched, twist_sigma));
             problem.camera_freedom.push(IntrinsicsFreedom::FREE);
             problem.cameras.push(stitched.clone());
             freed.cameras.push(at);
@@ -101,11 +120,13 @@ impl Freed {
 }
 
 /// What is known of a photo's stretch: as of a panorama that looks anywhere, ahead against the sides.
-fn prior(at: usize, stitched: &Camera) -> Option<CameraPrior> {
+fn prior(at: usize, stitched: &Camera, twist_sigma: f64) -> Option<CameraPrior> {
     let mut prior = CameraPrior::of_usual_photo(at as u32, stitched)?;
     for (known, name) in prior.parameters.iter_mut().zip(stitched.model.param_names()) {
-        if matches!(*name, "xx" | "xz") {
-            known.sigma = SIGMA;
+        match *name {
+            "xx" | "xz" => known.sigma = SIGMA,
+            "txx" | "txy" | "txz" | "tyz" | "tyy" => known.sigma = twist_sigma,
+            _ => {}
         }
     }
     Some(prior)
@@ -148,7 +169,7 @@ mod tests {
             ..BundleProblem::default()
         };
         let before = problem.clone();
-        let freed = Freed::new(&mut problem, &sphere, &[0, 2]);
+        let freed = Freed::new(&mut problem, &sphere, &[0, 2], TWIST_SIGMA);
         assert_eq!(freed.cameras, [2, 3]);
         assert_eq!(problem.poses.iter().map(|pose| pose.camera).collect::<Vec<_>>(), [2, 0, 3]);
         assert_eq!(problem.camera_freedom[..2], [IntrinsicsFreedom::FIXED; 2]);
@@ -164,7 +185,7 @@ mod tests {
 
     #[test]
     fn noise_is_not_worth_a_stretch_that_nothing_else_speaks_for() {
-        let freed = Freed { cameras: vec![3, 4] };
+        let freed = Freed { cameras: vec![3, 4], terms: 4 };
         let (unlikely, likely) =
             (PhotoStretch::default(), PhotoStretch { is_likely: true, ..PhotoStretch::default() });
         for stretch in [unlikely, likely] {

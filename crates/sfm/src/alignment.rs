@@ -24,7 +24,7 @@ use setloc_features::{
 };
 
 use crate::{
-    AlignedTrack, ImageId, MeasuredPositions, Observation, Place, Reconstruction, Rigid,
+    AlignedTrack, CameraId, ImageId, MeasuredPositions, Observation, Place, Reconstruction, Rigid,
     bundle::{
         self, BundleObservation, BundleParams, BundlePoint, BundlePose, BundleProblem, CameraPrior,
         IntrinsicsFreedom, RobustLoss,
@@ -34,8 +34,12 @@ use crate::{
     solvers::tangent_basis,
 };
 
+/// By how much a panorama's stretch and twist differ from what all of one camera share, as a deviation of each term: 0.0002–0.0008
+/// in four real places.
+pub(crate) const STITCHING_OF_EACH: f64 = 0.0005;
+
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 22;
+pub const ALIGNMENT_VERSION: u32 = 24;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;
@@ -168,6 +172,8 @@ pub fn align_tracks<E: Send>(
     solve(&first, &mut problem, tracks.component, known.positions);
     let (references, planes) = (tracks.references, tracks.planes);
     store(component, features, &problem);
+    let shared = component.cameras.len();
+    stitch_each(component, known.cameras);
     // Now it is known where the patches lie in views that no keypoint ties to them.
     let tracks = Tracks { planes, references, ..Tracks::new(params, component, features) };
     let middles = tracks.middles(&aligned);
@@ -177,6 +183,9 @@ pub fn align_tracks<E: Send>(
     .concat();
     report.further = further.len();
     let mut problem = tracks.problem(known.cameras, &aligned, &middles, &further);
+    for prior in problem.camera_priors.iter_mut().filter(|prior| prior.camera as usize >= shared) {
+        prior.hold_stretch(&tracks.component.cameras[prior.camera as usize], STITCHING_OF_EACH);
+    }
     solve(&bundle, &mut problem, tracks.component, known.positions);
     let placed = tracks.placed(&aligned, &middles, &further);
     store(component, features, &problem);
@@ -185,6 +194,19 @@ pub fn align_tracks<E: Send>(
     }
     templates.into_par_iter().for_each(drop);
     Ok(report)
+}
+
+/// Gives each panorama that is stretched a camera of its own, of what all of them share.
+fn stitch_each(component: &mut Reconstruction, camera_fixed: &[bool]) {
+    let registered: Vec<ImageId> = component.registered().collect();
+    for image in registered {
+        let shared = component.images[image.index()].camera;
+        if component.cameras[shared.index()].is_stretched() && camera_fixed.get(shared.index()) != Some(&true)
+        {
+            component.images[image.index()].camera = CameraId(component.cameras.len() as u32);
+            component.cameras.push(component.cameras[shared.index()].clone());
+        }
+    }
 }
 
 /// What `work` finds in the pixels of each image; the first error of `load` in the order of images.
@@ -565,7 +587,12 @@ impl<'a> Tracks<'a> {
             users[component.images[image.index()].camera.index()].push(image);
         }
         for (camera, freedom) in problem.camera_freedom.iter_mut().enumerate() {
-            let is_told = || users[camera].len() >= 2 || component.tells_camera_of(&users[camera]);
+            let is_told = || match &users[camera][..] {
+                [] => false,
+                [_] if component.cameras[camera].is_stretched() => true,
+                [one] => component.tells_camera_of(&[*one]),
+                _ => true,
+            };
             if camera_fixed.get(camera) != Some(&true) && is_told() {
                 *freedom = IntrinsicsFreedom::FREE;
                 let usual = CameraPrior::of_usual_photo(camera as u32, &component.cameras[camera]);

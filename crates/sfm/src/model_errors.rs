@@ -22,10 +22,12 @@ use serde::{Deserialize, Serialize};
 use setloc_features::Camera;
 
 mod shared;
+mod stitching;
 
 pub use self::shared::BearingField;
-use self::shared::{moved, shared_sigma_rad};
-use crate::alignment::{adjustable_poses, hold_by_positions, shares_standpoints};
+use self::shared::shared_sigma_rad;
+use self::stitching::{OwnCameras, SharedStitching, draw_priors, move_places};
+use crate::alignment::{STITCHING_OF_EACH, adjustable_poses, hold_by_positions, shares_standpoints};
 use crate::bundle::{
     self, BundleObservation, BundlePoint, BundleProblem, CameraPrior, IntrinsicsFreedom, RobustLoss,
 };
@@ -48,6 +50,8 @@ pub struct ModelErrors {
     poses: Vec<Vec<Option<Rigid>>>,
     /// The model's cameras by draw; none where no draw changes any.
     cameras: Vec<Vec<Camera>>,
+    /// The cameras that are one panorama's each.
+    own: OwnCameras,
 }
 
 /// One standard deviation of a pose, of all directions together.
@@ -84,19 +88,28 @@ impl ModelErrors {
             return None;
         }
         let shared_sigma_rad = shared_sigma_rad(model);
+        let own = OwnCameras::of(model);
+        let shared_stitching = SharedStitching::of(&problem, &own);
         let of_draw = |draw: u32| {
-            let fields: Vec<BearingField> =
-                images.iter().map(|&image| BearingField::new(shared_sigma_rad, image, draw)).collect();
+            let field = |&image: &ImageId| {
+                BearingField::new(shared_sigma_rad, image, draw).with_changes(own.drawn(model, image, draw))
+            };
+            let fields: Vec<BearingField> = images.iter().map(field).collect();
             let mut rng = ChaCha8Rng::seed_from_u64(!u64::from(draw));
             let mut sign = |_| if rng.random_bool(0.5) { 1.0 } else { -1.0 };
             let signs: Vec<f64> = (0..model.points.len()).map(&mut sign).collect();
             let mut drawn = problem.clone();
-            for (seen, residual) in drawn.observations.iter_mut().zip(&residuals) {
+            let error = |(seen, residual): (&BundleObservation, &Vector3<f64>)| {
                 let camera = &problem.cameras[problem.poses[seen.pose as usize].camera as usize];
-                let error = |bearing: &Vector3<f64>| {
-                    residual * signs[seen.point as usize] + fields[seen.pose as usize].at(bearing)
-                };
-                seen.pixel = moved(camera, &seen.pixel, error).unwrap_or(seen.pixel);
+                let bearing = camera.unproject(&seen.pixel)?;
+                Some(residual * signs[seen.point as usize] + fields[seen.pose as usize].at(&bearing))
+            };
+            let errors: Vec<_> = problem.observations.iter().zip(&residuals).map(error).collect();
+            move_places(&mut drawn, &errors);
+            let mut of_stitching = ChaCha8Rng::seed_from_u64(u64::from(draw));
+            match &shared_stitching {
+                Some(shared) => shared.hold(&mut drawn, &mut of_stitching, &errors),
+                None => draw_priors(&mut drawn, &mut of_stitching),
             }
             let off = |deviation: f64| (deviation * normal(&mut rng)).exp();
             hold_lengths(&mut drawn, model, &pose_of_image, off);
@@ -129,12 +142,12 @@ impl ModelErrors {
         if !model.cameras.iter().any(Camera::is_stretched) {
             cameras.clear();
         }
-        Some(Self { shared_sigma_rad, poses, cameras })
+        Some(Self { shared_sigma_rad, poses, cameras, own })
     }
 
     /// Draws of poses, by draw and image, whose bearings share errors of this standard deviation.
     pub fn new(shared_sigma_rad: f64, poses: Vec<Vec<Option<Rigid>>>) -> Self {
-        Self { shared_sigma_rad, poses, cameras: Vec::new() }
+        Self { shared_sigma_rad, poses, cameras: Vec::new(), own: OwnCameras::default() }
     }
 
     /// Standard deviation of what neighbouring bearings share, per tangent axis, in radians; 0 where residuals show none.
@@ -183,7 +196,8 @@ impl ModelErrors {
             let own = model.cameras.get(camera)?;
             (drawn != own).then(|| [own.clone(), drawn.clone()])
         });
-        BearingField::new(self.shared_sigma_rad, image, draw).with_change(changed)
+        let changes = changed.into_iter().chain(self.own.drawn(model, image, draw));
+        BearingField::new(self.shared_sigma_rad, image, draw).with_changes(changes)
     }
 }
 
@@ -209,12 +223,19 @@ fn problem_of(model: &Reconstruction) -> (BundleProblem, Vec<Option<u32>>) {
     let freedom = |camera: &Camera| {
         if camera.is_stretched() { IntrinsicsFreedom::FREE } else { IntrinsicsFreedom::FIXED }
     };
+    let own = OwnCameras::of(model);
     let stretched = model.cameras.iter().enumerate().filter(|(_, camera)| camera.is_stretched());
     let problem = BundleProblem {
         cameras: model.cameras.clone(),
         camera_freedom: model.cameras.iter().map(freedom).collect(),
         camera_priors: stretched
-            .filter_map(|(at, camera)| CameraPrior::of_usual_photo(at as u32, camera))
+            .filter_map(|(at, camera)| {
+                let mut prior = CameraPrior::of_usual_photo(at as u32, camera)?;
+                if own.kind(at).is_some() {
+                    prior.hold_stretch(camera, STITCHING_OF_EACH);
+                }
+                Some(prior)
+            })
             .collect(),
         poses,
         points: model.points.iter().map(free).collect(),
@@ -395,9 +416,16 @@ mod tests {
 
     /// Squared errors of centres and of rotations over those stated, of four streets.
     fn actual_over_stated(noise_px: f64, shared_rad: f64, check: impl Fn(&ModelErrors)) -> [f64; 2] {
+        ratios((0..4).map(|seed| street(noise_px, shared_rad, seed)), check)
+    }
+
+    /// The same of any models and their true poses.
+    fn ratios(
+        models: impl Iterator<Item = (Reconstruction, Vec<Rigid>)>,
+        check: impl Fn(&ModelErrors),
+    ) -> [f64; 2] {
         let (mut squared, mut expected) = ([0.0; 2], [0.0; 2]);
-        for seed in 0..4 {
-            let (model, truth) = street(noise_px, shared_rad, seed);
+        for (model, truth) in models {
             let errors = ModelErrors::of_model(&model, None).expect("has places");
             check(&errors);
             let estimated = model.images.iter().map(|image| image.world_from_camera.unwrap());
@@ -492,6 +520,46 @@ mod tests {
         }
     }
 
+    /// Each panorama is stitched a little otherwise than the others, and adjusted as it is held near to them.
+    #[test]
+    fn what_each_panorama_is_stitched_otherwise_is_in_what_is_told_of_poses() {
+        let mut shared = Camera::equirectangular(4096, 2048).as_stitched().unwrap();
+        shared.params[4] = -0.003;
+        let stitched = |seed: u64| {
+            let (mut model, truth) = seen_street(6, &shared, 0.2, 0.0, seed);
+            let mut rng = ChaCha8Rng::seed_from_u64(50 + seed);
+            let own: Vec<Camera> = (0..6)
+                .map(|_| {
+                    let mut own = shared.clone();
+                    own.params[4..].iter_mut().for_each(|term| *term += STITCHING_OF_EACH * normal(&mut rng));
+                    own
+                })
+                .collect();
+            // What is seen by the shared camera is where each one's own shows it.
+            for point in &mut model.points {
+                let places = &mut point.aligned.as_mut().unwrap().places;
+                for (seen, place) in point.track.iter().zip(places) {
+                    let bearing = shared.unproject(&place.pixel).unwrap();
+                    place.pixel = own[seen.image.index()].project(&bearing).unwrap();
+                }
+            }
+            let adjust = |model: &mut Reconstruction| {
+                let (mut problem, _) = problem_of(model);
+                bundle::solve(&bundle::BundleParams::default(), &mut problem);
+                take(model, &problem);
+            };
+            adjust(&mut model);
+            for at in 0..6 {
+                model.images[at].camera = CameraId(model.cameras.len() as u32);
+                model.cameras.push(model.cameras[0].clone());
+            }
+            adjust(&mut model);
+            (model, truth)
+        };
+        let ratios = ratios((0..4).map(stitched), |errors| assert_eq!(errors.own.kind(1), Some(0)));
+        assert!(ratios.iter().all(|ratio| (0.3..3.0).contains(ratio)), "{ratios:?}");
+    }
+
     #[test]
     fn how_far_a_stretch_may_be_off_is_told() {
         let mut camera = Camera::equirectangular(4096, 2048).as_stitched().unwrap();
@@ -513,7 +581,8 @@ mod tests {
                 let waves = BearingField::new(errors.shared_sigma_rad(), ImageId(1), draw).at(&bearing);
                 let seen = drawn.unproject(&model.cameras[0].project(&bearing).unwrap()).unwrap();
                 let change = errors.field(&model, ImageId(1), draw).at(&bearing) - waves;
-                assert!((change - (seen - bearing)).norm() < 1e-6, "{change}");
+                let across = seen - bearing * bearing.dot(&seen);
+                assert!((change - across).norm() < 1e-9, "{change} {across}");
             }
         }
         assert!((0.3..3.0).contains(&(squared / expected)), "{squared} {expected}");

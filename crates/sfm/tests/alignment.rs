@@ -43,18 +43,23 @@ fn paint(place: &Vector3<f64>) -> f64 {
 
 impl Room {
     fn new(name: &str) -> Self {
-        let mut rng = seeded(name);
         let camera = Camera::equirectangular(640, 320);
+        Self::seen_by(name, &[(); 4].map(|()| camera.clone()), camera)
+    }
+
+    /// Seen by these cameras, of which the model has one.
+    fn seen_by(name: &str, cameras: &[Camera; 4], camera: Camera) -> Self {
+        let mut rng = seeded(name);
         let truth: Vec<Rigid> = (0..4)
             .map(|k| {
                 let center = Vector3::new(f64::from(k) - 1.5, 0.2 * normal(&mut rng), 0.5 * normal(&mut rng));
                 Rigid::new(random_rotation(&mut rng), center)
             })
             .collect();
-        let lens = Camera::equirectangular(640, 320);
         let pyramids = truth
             .iter()
-            .map(|pose| {
+            .zip(cameras)
+            .map(|(pose, lens)| {
                 let pixels = (0..320).flat_map(|y| (0..640).map(move |x| (x, y)));
                 let values = pixels
                     .map(|(x, y)| {
@@ -76,7 +81,7 @@ impl Room {
                 if rng.random_bool(0.3) {
                     continue;
                 }
-                let pixel = camera
+                let pixel = cameras[image]
                     .project(&pose.inverse_transform_point(&position))
                     .expect("a panorama sees everywhere");
                 let noisy = pixel + Vector2::new(normal(&mut rng), normal(&mut rng)) * NOISE_PX;
@@ -119,9 +124,14 @@ impl Room {
     }
 
     fn align(&self, params: &AlignmentParams) -> (Reconstruction, AlignmentReport) {
+        self.align_knowing(&[true], params)
+    }
+
+    fn align_knowing(&self, cameras: &[bool], params: &AlignmentParams) -> (Reconstruction, AlignmentReport) {
         let (mut model, features) = (self.model.clone(), self.features.iter().collect::<Vec<_>>());
         let load = |image: ImageId| Ok::<_, Infallible>(Arc::clone(&self.pyramids[image.index()]));
-        let report = align_tracks(params, &mut model, &features, ALL_CAMERAS, load).unwrap();
+        let known = KnownOfComponent { cameras, positions: None };
+        let report = align_tracks(params, &mut model, &features, known, load).unwrap();
         (model, report)
     }
 
@@ -218,4 +228,34 @@ fn photos_of_one_standpoint_stay_and_their_points_get_places() {
     for (point, aligned) in model.points.iter().zip(&aligned) {
         assert!(aligned.as_ref().is_none_or(|aligned| aligned.places.len() == point.track.len()));
     }
+}
+
+#[test]
+fn panoramas_that_are_each_stitched_a_little_otherwise_get_cameras_of_their_own() {
+    let mut rng = seeded("panoramas_that_are_each_stitched_a_little_otherwise_get_cameras_of_their_own");
+    let mut shared = Camera::equirectangular(640, 320).as_stitched().unwrap();
+    shared.params[4..].copy_from_slice(&[-0.003, 0.0, 0.001, 0.0, 0.0, -0.001, 0.002, 0.0, 0.0]);
+    let cameras = [(); 4].map(|()| {
+        let mut own = shared.clone();
+        own.params[4..].iter_mut().for_each(|term| *term += 0.001 * normal(&mut rng));
+        own
+    });
+    let room = Room::seen_by("each stitched otherwise", &cameras, shared.clone());
+    let (own, _) = room.align_knowing(&[false], &AlignmentParams::default());
+    assert_eq!(own.cameras.len(), 5);
+    let found: Vec<&Camera> = own.registered().map(|image| own.camera_of(image)).collect();
+    let off =
+        |found: &[&Camera]| -> f64 { found.iter().zip(&cameras).map(|(a, b)| squared_terms(a, b)).sum() };
+    let (after, before) = (off(&found), off(&[&shared; 4]));
+    assert!(after < 0.25 * before, "{after} {before}");
+    // Told to be as they are, all keep the one.
+    let (told, _) = room.align_knowing(&[true], &AlignmentParams::default());
+    assert_eq!(told.cameras, [shared]);
+    let (with, without) = (room.error(&own), room.error(&told));
+    assert!(with < 0.5 * without, "{with} {without}");
+}
+
+/// Sum of the squares of what the stitching of two panoramas differs by.
+fn squared_terms(a: &Camera, b: &Camera) -> f64 {
+    a.params[4..].iter().zip(&b.params[4..]).map(|(a, b)| (a - b).powi(2)).sum()
 }

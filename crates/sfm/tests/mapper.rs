@@ -241,7 +241,7 @@ fn a_street_of_panoramas_is_mapped_to_millimetres() {
 fn stretched_panoramas_are_found_to_be_and_others_are_not() {
     let plain = Camera::equirectangular(3072, 1536);
     let mut stitched = plain.as_stitched().expect("is plain");
-    let truth = [-0.0035, 0.0004, 0.001, -0.0006];
+    let truth = [-0.0035, 0.0004, 0.001, -0.0006, -0.0002, 0.0005, 0.0015, -0.0012, 0.0008];
     stitched.params[4..].copy_from_slice(&truth);
     let street = Street::of_panoramas_with(&stitched, 10, 0.3, 0, 11);
     let cameras = vec![plain.clone(); 10];

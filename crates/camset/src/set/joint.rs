@@ -2,6 +2,7 @@
 
 mod answers;
 mod distrust;
+mod hinges;
 mod hung;
 mod observations;
 mod walls;
@@ -67,6 +68,8 @@ pub(crate) struct ComponentPoses {
     pub refined: Vec<PhotoLocalization>,
     /// Whether it stands elsewhere than where it is localized alone.
     pub elsewhere: Vec<bool>,
+    /// Whether too few matches give their scale.
+    pub lacks_scale: bool,
     /// Scene points that each photo sees itself.
     pub scene_points: Vec<usize>,
     pub remarks: Vec<String>,
@@ -226,6 +229,7 @@ impl Component<'_> {
             .max(sights.seen_from_elsewhere(&rigid.sights, &rigid.lone));
         // One standpoint's matches place that standpoint; a few chance matches of the others then fit some scale.
         let has_scale = self.members.len() > 1;
+        let mut lacks_scale = false;
         if has_scale
             && elsewhere < params.verdict.min_inliers / 2
             && !self.scale_stands_out(&joint, &rays, &set_from_camera, &rigid)
@@ -243,7 +247,9 @@ impl Component<'_> {
                 elsewhere = joint.walls.iter().sum();
                 reasons.push(by_walls.reason);
             }
-            if elsewhere < params.verdict.min_inliers / 2 {
+            lacks_scale = elsewhere < params.verdict.min_inliers / 2;
+            if lacks_scale {
+                joint.doubt_scale(joint.main_standpoint(), &joint.away_from_main());
                 reasons.push(format!(
                     "its scale rests on {elsewhere} matches seen from elsewhere than the rest"
                 ));
@@ -255,8 +261,10 @@ impl Component<'_> {
             reasons.push(DOUBTFUL.to_owned());
             support = weaker(support, Verdict::Uncertain);
         }
+        let doubtful = if lacks_scale { Vec::new() } else { self.doubt_beyond_hinges(&mut joint) };
         let (mut refined, mut elsewhere_alone) =
             self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
+        self.doubt_photos(&doubtful, &mut refined);
         let is_distrusted = is_distrusted(&joint.model.photos, &elsewhere_alone);
         let mut without_scale = Vec::new();
         if has_scale
@@ -309,6 +317,7 @@ impl Component<'_> {
             elsewhere: (refined.iter().zip(elsewhere_alone))
                 .map(|(photo, elsewhere)| elsewhere && photo.world_from_camera.is_some())
                 .collect(),
+            lacks_scale,
             refined,
             remarks,
         }))

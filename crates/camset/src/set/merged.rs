@@ -71,6 +71,7 @@ fn merged(params: &VerdictParams, components: &[Scene<'_>], mut answers: Vec<Ans
         merged.set.rigid.push(rigid);
         merged.set.paths.push(answers[at].set.paths[photo].clone());
         merged.elsewhere.push(answers[at].elsewhere[photo]);
+        merged.lacks_scale.push(answers[at].lacks_scale[photo]);
         merged.seen.push(answers[at].seen[photo].clone());
     }
     for (answer, scene) in answers.into_iter().zip(components) {

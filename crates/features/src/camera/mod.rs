@@ -17,7 +17,7 @@ use lens::{Intrinsics, Lens};
 pub use model::{CameraModel, ParamRole};
 
 /// The most intrinsic parameters any model has.
-pub const MAX_CAMERA_PARAMS: usize = 8;
+pub const MAX_CAMERA_PARAMS: usize = 13;
 
 /// Focal lengths of [`Camera::fisheye_guesses`] in units of the longer side.
 const FISHEYE_FOCALS: [f64; 7] = [0.2, 0.24, 0.29, 0.35, 0.42, 0.5, 0.6];
@@ -305,6 +305,13 @@ impl Camera {
         stitched::of_plain(&self.params, plain)
     }
 
+    /// [`Camera::ray`] of a stretched panorama, its sphere being known.
+    pub fn ray_of_plain(&self, plain: &PlainRay) -> (Vector3<f64>, f64) {
+        debug_assert!(self.is_stretched());
+        let (bearing, d_pixel) = stitched::ray_of_plain(&self.params, plain);
+        (bearing, pixel_angle(&d_pixel))
+    }
+
     /// [`Camera::unproject`] and [`Camera::pixel_angle`] of a pixel in one, which spares inverting the distortion twice.
     pub fn ray(&self, pixel: &Vector2<f64>) -> Option<(Vector3<f64>, f64)> {
         if let Some((lens, k)) = self.lens() {
@@ -365,7 +372,7 @@ impl Camera {
     /// A plain panorama as one whose stretch can be estimated, none as yet; `None` of other cameras.
     pub fn as_stitched(&self) -> Option<Self> {
         let mut params = self.params.clone();
-        params.resize(MAX_CAMERA_PARAMS, 0.0);
+        params.resize(CameraModel::StitchedEquirectangular.num_params(), 0.0);
         let is_plain = self.model == CameraModel::Equirectangular;
         is_plain.then_some(Self { model: CameraModel::StitchedEquirectangular, params, ..*self })
     }
@@ -390,6 +397,11 @@ impl Camera {
         let of_stretch =
             |(value, role): (&f64, &ParamRole)| (*role == ParamRole::Stretch).then_some(value.abs());
         self.params.iter().zip(self.param_roles()).filter_map(of_stretch).fold(0.0, f64::max)
+    }
+
+    /// The terms by which directions are twisted (see [`CameraModel::StitchedEquirectangular`]); none of other cameras.
+    pub fn twist(&self) -> &[f64] {
+        if self.is_stretched() { stitched::twist(&self.params) } else { &[] }
     }
 
     /// Whether the left and the right border of the image are neighbours on the sphere.

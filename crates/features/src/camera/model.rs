@@ -26,8 +26,8 @@ pub enum CameraModel {
     Equirectangular,
     /// f, cx, cy of the paper's rectilinear formula, which is no pinhole off the axes; for reproduction only.
     PaperRectilinear,
-    /// A panorama whose stitching stretches directions: w, h of the full sphere, the crop's left and top (0 for a whole
-    /// one), and the stretch xx, xy, xz, yz. COLMAP has no such model.
+    /// A panorama whose stitching moves directions: w, h of the full sphere, the crop's left and top (0 for a whole one), the
+    /// stretch xx, xy, xz, yz, and the twist txx, txy, txz, tyz, tyy. COLMAP has no such model.
     StitchedEquirectangular,
 }
 
@@ -45,7 +45,7 @@ pub enum ParamRole {
     SphereSize,
     /// Left or top in pixels of a panorama's crop; never refined.
     CropOffset,
-    /// A term by which a panorama's directions are stretched.
+    /// A term by which a panorama's directions are stretched or twisted.
     Stretch,
 }
 
@@ -125,7 +125,9 @@ impl CameraModel {
             Self::Opencv => &["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"],
             Self::OpencvFisheye => &["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"],
             Self::Equirectangular => &["w", "h", "left", "top"],
-            Self::StitchedEquirectangular => &["w", "h", "left", "top", "xx", "xy", "xz", "yz"],
+            Self::StitchedEquirectangular => {
+                &["w", "h", "left", "top", "xx", "xy", "xz", "yz", "txx", "txy", "txz", "tyz", "tyy"]
+            }
         }
     }
 
@@ -150,7 +152,13 @@ impl CameraModel {
             ],
             Self::Equirectangular => &[SphereSize, SphereSize, CropOffset, CropOffset],
             Self::StitchedEquirectangular => {
-                &[SphereSize, SphereSize, CropOffset, CropOffset, Stretch, Stretch, Stretch, Stretch]
+                const ROLES: [ParamRole; MAX_CAMERA_PARAMS] = {
+                    let mut roles = [Stretch; MAX_CAMERA_PARAMS];
+                    (roles[0], roles[1], roles[2], roles[3]) =
+                        (SphereSize, SphereSize, CropOffset, CropOffset);
+                    roles
+                };
+                &ROLES
             }
         }
     }

@@ -1,4 +1,4 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::path::Path;
 
@@ -32,12 +32,21 @@ pub fn colmap_lacks(model: &Reconstruction) -> Option<String> {
     })
 }
 
+/// The camera that each one is written as: panoramas of one size that differ in their stretch have the first one's.
+fn written_as(model: &Reconstruction, used: &BTreeSet<CameraId>) -> BTreeMap<CameraId, CameraId> {
+    let is_stretched = |id: &CameraId| model.cameras[id.index()].is_stretched();
+    let plain = |id: &CameraId| model.cameras[id.index()].without_stretch();
+    let first = |id: &CameraId| used.iter().find(|other| is_stretched(other) && plain(other) == plain(id));
+    used.iter().map(|id| (*id, *first(id).filter(|_| is_stretched(id)).unwrap_or(id))).collect()
+}
+
 /// Writes a model as COLMAP's `cameras.txt`, `images.txt` and `points3D.txt`.
 ///
 /// Ids count from 1. COLMAP wants camera-from-world poses. `features[i]` belongs to image `i`; without it the line of
 /// 2D points stays empty, and tracks have no element in that image.
 ///
-/// COLMAP has no stretched panoramas: they are written as plain ones, and their keypoints where such a one shows them.
+/// COLMAP has no stretched panoramas: they are written as plain ones, and their keypoints where such a one shows them. Those of one
+/// size then have one camera.
 ///
 /// # Errors
 /// When COLMAP lacks a camera's model ([`colmap_lacks`]) or a file cannot be written.
@@ -51,7 +60,8 @@ pub fn write_colmap(
     }
     let used: BTreeSet<CameraId> = model.registered().map(|id| model.images[id.index()].camera).collect();
     let mut cameras = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
-    for id in used {
+    let written = written_as(model, &used);
+    for id in written.values().collect::<BTreeSet<_>>() {
         let camera = model.cameras[id.index()].without_stretch();
         let (name, width, height) = (camera.model.name(), camera.width, camera.height);
         let params: Vec<String> = camera.params.iter().map(f64::to_string).collect();
@@ -91,7 +101,7 @@ pub fn write_colmap(
         let Some(pose) = image.world_from_camera else { return Ok(lines) };
         let camera_from_world = pose.inverse();
         let (q, t) = (camera_from_world.rotation.quaternion(), camera_from_world.translation);
-        let ids = format!("{} {}", image.camera.0 + 1, image.name);
+        let ids = format!("{} {}", written[&image.camera].0 + 1, image.name);
         writeln!(lines, "{} {} {} {} {} {} {} {} {ids}", at + 1, q.w, q.i, q.j, q.k, t.x, t.y, t.z)?;
         let camera = &model.cameras[image.camera.index()];
         let plain = camera.is_stretched().then(|| camera.without_stretch());
@@ -240,10 +250,16 @@ mod tests {
         let keypoint = Keypoint { x: 130.0, y: 40.0, size: 3.0, orientation: 0.0, noise_px: 0.5 };
         let features = ImageFeatures { keypoints: vec![keypoint], ..ImageFeatures::default() };
         let folder = tempfile::tempdir().unwrap();
-        write_colmap(folder.path(), &scene(camera.clone(), &[]), &[Some(&features); 3]).unwrap();
+        let mut model = scene(camera.clone(), &[]);
+        // Another one of the same size that is stretched otherwise.
+        let (mut other, at) = (camera.clone(), CameraId(model.cameras.len() as u32));
+        other.params[5] = 0.002;
+        model.cameras.push(other);
+        model.images[1].camera = at;
+        write_colmap(folder.path(), &model, &[Some(&features); 3]).unwrap();
         let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
         let cameras = read("cameras.txt");
-        assert_eq!(cameras.lines().nth(1), Some("1 EQUIRECTANGULAR 200 100 200 100"));
+        assert_eq!(cameras.lines().skip(1).collect::<Vec<_>>(), ["1 EQUIRECTANGULAR 200 100 200 100"]);
         let images = read("images.txt");
         let numbers: Vec<f64> =
             images.lines().nth(3).unwrap().split(' ').map(|number| number.parse().unwrap()).collect();

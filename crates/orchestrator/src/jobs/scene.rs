@@ -319,7 +319,7 @@ fn stretch_note((component, model): (usize, &Reconstruction)) -> Option<String> 
     let percent = 100.0 * used.fold(0.0, f64::max);
     (percent > 0.0).then(|| {
         format!(
-            "the panoramas{} stretch directions by up to {percent:.2} % (stitching, lenses), which is taken out \
+            "the panoramas{} stretch or twist directions by up to {percent:.2} % (stitching, lenses), which is taken out \
              (sfm.calibrate_panoramas)",
             of_component(component)
         )

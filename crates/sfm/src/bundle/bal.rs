@@ -339,7 +339,7 @@ mod tests {
             residual: [0.0; 2],
             point: [[0.0; 3]; 2],
             block: [[0.0; 9]; 2],
-            extra: [[0.0; 8]; 2],
+            extra: [[0.0; setloc_features::MAX_CAMERA_PARAMS]; 2],
         };
         let link = Link { point: 0, block: 0, extra: NONE };
         let mut at = |observation: usize, step: &[f64; 9], shift: Vector3<f64>| {

@@ -73,6 +73,9 @@ pub(super) struct StepSums {
     pub squared_norm: f64,
 }
 
+/// Rows of the blocks of stitched panoramas' cameras, the most frequent beside poses.
+const STITCHING: usize = 9;
+
 impl Chunk {
     /// Subtracts W V⁻¹ Wᵀ from S and adds up W V⁻¹ g_p, for damping λ.
     pub fn eliminate<const D: usize>(&mut self, lambda: f64, couplings: &Couplings, pattern: &BlockPattern) {
@@ -119,7 +122,11 @@ impl Chunk {
                     let offset = pattern.offset(row.block as usize, column.block as usize);
                     let values = &mut self.schur[offset..offset + row_dim * column_dim];
                     if row_dim == D && column_dim == D {
-                        subtract_outer::<D>(values, row_y, column_y);
+                        subtract_outer::<D, D>(values, row_y, column_y);
+                    } else if row_dim == STITCHING && column_dim == D {
+                        subtract_outer::<STITCHING, D>(values, row_y, column_y);
+                    } else if row_dim == STITCHING && column_dim == STITCHING {
+                        subtract_outer::<STITCHING, STITCHING>(values, row_y, column_y);
                     } else {
                         subtract_outer_sized(values, row_y, column_y, row_dim, column_dim);
                     }
@@ -273,12 +280,12 @@ fn add_columns(to: &mut [f64], w: &[f64], z: [f64; 3]) {
     }
 }
 
-/// values (D×D) −= a bᵀ with a, b of D×3, all by columns.
+/// values (ROWS×COLUMNS) −= a bᵀ with a of ROWS×3 and b of COLUMNS×3, all by columns.
 #[inline]
-fn subtract_outer<const D: usize>(values: &mut [f64], a: &[f64], b: &[f64]) {
-    let ([a0, a1, a2], [b0, b1, b2]) = (a.as_chunks::<D>().0, b.as_chunks::<D>().0) else { return };
-    for (column, values) in values.as_chunks_mut::<D>().0.iter_mut().enumerate() {
-        for row in 0..D {
+fn subtract_outer<const ROWS: usize, const COLUMNS: usize>(values: &mut [f64], a: &[f64], b: &[f64]) {
+    let ([a0, a1, a2], [b0, b1, b2]) = (a.as_chunks::<ROWS>().0, b.as_chunks::<COLUMNS>().0) else { return };
+    for (column, values) in values.as_chunks_mut::<ROWS>().0.iter_mut().enumerate() {
+        for row in 0..ROWS {
             values[row] -= a0[row] * b0[column] + a1[row] * b1[column] + a2[row] * b2[column];
         }
     }

@@ -627,11 +627,11 @@ fn add(to: &mut [f64], from: &[f64]) {
 }
 
 /// `to` (rows of `a` × rows of `b`, by columns) += weight · Σ aᵢ bᵢᵀ.
-fn add_product(to: &mut [f64], weight: f64, a: [&[f64]; 2], b: [&[f64]; 2]) {
-    let dim = a[0].len();
-    for column in 0..b[0].len() {
-        for row in 0..dim {
-            to[column * dim + row] += weight * (a[0][row] * b[0][column] + a[1][row] * b[1][column]);
+#[inline]
+fn add_product(to: &mut [f64], weight: f64, [a0, a1]: [&[f64]; 2], [b0, b1]: [&[f64]; 2]) {
+    for ((to, b0), b1) in to.chunks_exact_mut(a0.len().max(1)).zip(b0).zip(b1) {
+        for ((to, a0), a1) in to.iter_mut().zip(a0).zip(a1) {
+            *to += weight * (a0 * b0 + a1 * b1);
         }
     }
 }

@@ -124,7 +124,7 @@ impl CameraPrior {
     /// What holds for the usual photo, as standard deviations: the principal point lies within 0.5 % of the longer side of
     /// the image's centre, the first radial coefficient is within 0.2, further ones within 0.05, tangential ones within
     /// 0.001, and pixels are square to 0.1 %; nothing is known of the focal length. Stitched panoramas are stretched
-    /// ahead against the sides by 0.4 %, otherwise by 0.1 %, and no loss lets go of that. `None` for plain panoramas,
+    /// ahead against the sides by 0.4 %, otherwise by 0.1 %, and twisted by 0.2 %, and no loss lets go of that. `None` for plain panoramas,
     /// which have nothing to estimate.
     ///
     /// Calibrations of phones, action and system cameras put the principal point 0.1–1 % off the centre. Photos that were
@@ -139,9 +139,12 @@ impl CameraPrior {
                 (ParamRole::PrincipalPoint, "cx") => (width / 2.0, 0.005 * width.max(height)),
                 (ParamRole::PrincipalPoint, _) => (height / 2.0, 0.005 * width.max(height)),
                 (ParamRole::Distortion, "k" | "k1") => (0.0, 0.2),
-                (ParamRole::Distortion, "p1" | "p2") => (0.0, 0.001),
+                (ParamRole::Distortion, "p1" | "p2") | (ParamRole::Stretch, "xy" | "xz" | "yz") => {
+                    (0.0, 0.001)
+                }
                 (ParamRole::Distortion, _) => (0.0, 0.05),
-                (ParamRole::Stretch, "xx") => (0.0, 0.004),
+                (ParamRole::Stretch, "xx") => (0.0, 0.003),
+                (ParamRole::Stretch, "txy" | "txz" | "tyz") => (0.0, 0.0015),
                 (ParamRole::Stretch, _) => (0.0, 0.001),
                 _ => (0.0, f64::INFINITY),
             };
@@ -180,6 +183,14 @@ impl CameraPrior {
             .fold([f64::INFINITY, 0.0], |[low, high], focal| [focal.min(low), focal.max(high)]);
         let aspect_sigma = 0.001_f64.hypot(longest / shortest - 1.0);
         Self { camera: index, parameters, aspect_sigma, loss: RobustLoss::Trivial }
+    }
+
+    /// Holds the terms of a camera's stretch where they are, to this deviation.
+    pub fn hold_stretch(&mut self, camera: &Camera, sigma: f64) {
+        let terms = camera.param_roles().iter().zip(&camera.params).zip(&mut self.parameters);
+        for ((_, &value), known) in terms.filter(|((role, _), _)| **role == ParamRole::Stretch) {
+            *known = ParameterEstimate { value, sigma };
+        }
     }
 
     /// Whether it is one of this camera, in numbers that can be weighed.

@@ -75,8 +75,8 @@ impl PixelRay {
     /// As [`bearing_and_weight`].
     fn bearing_and_weight(&self, camera: &Camera) -> Option<(Vector3<f64>, f64)> {
         let Some(plain) = &self.plain else { return bearing_and_weight(camera, &self.pixel, self.noise_px) };
-        let ray = camera.unproject_plain(plain);
-        Some((ray.bearing, 1.0 / (ray.pixel_angle() * self.noise_px)))
+        let (bearing, pixel_angle) = camera.ray_of_plain(plain);
+        Some((bearing, 1.0 / (pixel_angle * self.noise_px)))
     }
 }
 

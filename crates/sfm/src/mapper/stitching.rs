@@ -10,7 +10,7 @@ use super::{MapperParams, adjust::try_camera, model::Model};
 /// The share of the cost that a stretch has to spare. In right models of panoramas that are not stretched it spares
 /// 0.00–0.11 %, in models of stretched ones 3–17 %.
 const MAX_COST: f64 = 0.98;
-/// What it has to spare at least, of half the sum of the loss of squares: four terms of noise spare 2.
+/// What it has to spare at least, of half the sum of the loss of squares: nine terms of noise spare 4.5.
 const MIN_GAIN: f64 = 10.0;
 /// Steps that show whether a stretch pays; what follows finds the rest.
 const MAX_ITERATIONS: u32 = 6;

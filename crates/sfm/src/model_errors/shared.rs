@@ -35,12 +35,12 @@ const WAVES: usize = 24;
 const LENGTH_RAD: f64 = 0.12;
 
 /// A smooth random field of bearing errors over the sphere, by random Fourier features (A. Rahimi, B. Recht, "Random
-/// features for large-scale kernel machines", NIPS 2007), and what a change of the camera adds to it.
+/// features for large-scale kernel machines", NIPS 2007), and what changes of the camera add to it.
 #[derive(Debug, Clone)]
 pub struct BearingField {
     waves: Vec<Wave>,
-    /// The camera and what it is in the draw.
-    changed: Option<[Camera; 2]>,
+    /// Cameras and what they are in the draw.
+    changes: Vec<[Camera; 2]>,
 }
 
 #[derive(Debug, Clone)]
@@ -54,7 +54,7 @@ impl BearingField {
     /// One of errors of this standard deviation per tangent axis.
     pub(super) fn new(sigma_rad: f64, image: ImageId, draw: u32) -> Self {
         if sigma_rad == 0.0 {
-            return Self { waves: Vec::new(), changed: None };
+            return Self { waves: Vec::new(), changes: Vec::new() };
         }
         let mut rng = ChaCha8Rng::seed_from_u64(u64::from(image.0) << 32 | u64::from(draw));
         let scale = sigma_rad * (2.0 / WAVES as f64).sqrt();
@@ -63,23 +63,20 @@ impl BearingField {
             let amplitude = Vector3::from_fn(|_, _| normal(&mut rng)) * scale;
             Wave { vector, phase: rng.random_range(0.0..std::f64::consts::TAU), amplitude }
         };
-        Self { waves: (0..WAVES).map(wave).collect(), changed: None }
+        Self { waves: (0..WAVES).map(wave).collect(), changes: Vec::new() }
     }
 
-    /// The same with what a change of the camera adds, from one to another.
-    pub(super) fn with_change(self, changed: Option<[Camera; 2]>) -> Self {
-        Self { changed, ..self }
+    /// The same with what changes of the camera add, from one to another each.
+    pub(super) fn with_changes(self, changes: impl IntoIterator<Item = [Camera; 2]>) -> Self {
+        Self { changes: changes.into_iter().collect(), ..self }
     }
 
     /// The error of a bearing of unit length in the camera frame, across it.
     pub fn at(&self, bearing: &Vector3<f64>) -> Vector3<f64> {
         let of_wave = |wave: &Wave| wave.amplitude * (wave.vector.dot(bearing) + wave.phase).cos();
         let mut sum: Vector3<f64> = self.waves.iter().map(of_wave).sum();
-        if let Some([own, drawn]) = &self.changed
-            && let Some(seen) = own.project(bearing).and_then(|pixel| drawn.unproject(&pixel))
-        {
-            sum += seen - bearing;
-        }
+        let changed = |[own, drawn]: &[Camera; 2]| Some(drawn.unproject(&own.project(bearing)?)? - bearing);
+        sum += self.changes.iter().filter_map(changed).sum::<Vector3<f64>>();
         sum - bearing * bearing.dot(&sum)
     }
 

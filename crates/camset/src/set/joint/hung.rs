@@ -6,7 +6,7 @@ use setloc_sfm::{BaselineLength, ImageId, Rigid};
 use super::{Component, Joint, standpoint};
 
 /// Local points that tie two photos.
-const MIN_TIE: usize = 8;
+pub(super) const MIN_TIE: usize = 8;
 
 /// A pair of photos whose length planes tell.
 pub(super) struct Hung {
