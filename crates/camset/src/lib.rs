@@ -74,7 +74,9 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 40: what the scene's poses may be off. 41: an adjustment's steps are stretched by its curvature. 42: scene points of uncertain
 /// depth are held by parallax. 43: points of a grown scene shift to where moved rays meet. 44: stretched photos go on from where they
 /// are refined to. 45: and are twisted. 46: as the scene's panoramas are. 47: scales that few matches give.
-pub const VERSION: u32 = 47;
+/// 48: photos among stitched panoramas err as these do; photos that the
+/// joint refinement leaves behind are where they are alone.
+pub const VERSION: u32 = 48;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 /// 2: points shift to where moved rays meet.

@@ -3,11 +3,15 @@
 //! Scene points of one region are off together, by the poses of the images that see them and by what their bearings share there, and
 //! so is a photo that sees little else. As in [`crate::common`] these errors are *considered* rather than estimated: for each draw of
 //! them the photos are adjusted again, and what their poses move by in the mean of the draws is added to their covariances.
+//!
+//! What neighbouring bearings of stitched panoramas share, those of photos that were cut from such do, too: where the scene's panoramas
+//! are, the bearings of each standpoint of the set have errors of their own of that size.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix6, Vector3};
 use rayon::prelude::*;
+use setloc_features::Camera;
 use setloc_sfm::bundle::{self, BundleParams, BundleProblem};
 use setloc_sfm::{BearingField, ImageId, ModelErrors, PointId};
 
@@ -38,10 +42,17 @@ impl HeldByScene {
             return None;
         }
         let images = self.images(scene);
+        // Photos in a place of stitched panoramas are mostly cut from such, too.
+        let is_stitched = scene.reconstruction.cameras.iter().any(Camera::is_stretched);
         let draws: Vec<u32> = (0..errors.draws()).collect();
         let deviations = |&draw: &u32| {
             let mut moved = problem.clone();
             self.apply(&Draw::new(scene, errors, draw, &images), &mut moved);
+            if is_stitched {
+                let fields: Vec<_> =
+                    (0..poses as u32).map(|pose| errors.field_of_another(pose, draw)).collect();
+                displace(&mut moved, |pose| fields.get(pose as usize));
+            }
             bundle::solve(params, &mut moved);
             let pairs = problem.poses.iter().zip(&moved.poses).take(poses);
             pairs.map(|(a, b)| deviation(&a.world_from_camera, &b.world_from_camera)).collect::<Vec<_>>()
@@ -72,11 +83,16 @@ impl HeldByScene {
             let pose = &mut problem.poses[pose as usize].world_from_camera;
             *pose = draw.errors.pose(image, draw.number).unwrap_or(*pose);
         }
-        for seen in &mut problem.observations {
-            let field = self.views.get(&seen.pose).and_then(|image| draw.fields.get(image));
-            let camera = &problem.cameras[problem.poses[seen.pose as usize].camera as usize];
-            seen.pixel = field.and_then(|field| field.moved(camera, &seen.pixel)).unwrap_or(seen.pixel);
-        }
+        displace(problem, |pose| self.views.get(&pose).and_then(|image| draw.fields.get(image)));
+    }
+}
+
+/// Moves what poses see by the errors of their bearings.
+fn displace<'f>(problem: &mut BundleProblem, field_of: impl Fn(u32) -> Option<&'f BearingField>) {
+    for seen in &mut problem.observations {
+        let camera = &problem.cameras[problem.poses[seen.pose as usize].camera as usize];
+        let there = field_of(seen.pose).and_then(|field| field.moved(camera, &seen.pixel));
+        seen.pixel = there.unwrap_or(seen.pixel);
     }
 }
 
@@ -172,6 +188,29 @@ mod tests {
             moved += usize::from((shift - expected).norm() < 0.1 * expected.norm());
         }
         assert!(moved > 180, "{moved}");
+    }
+
+    #[test]
+    fn photos_among_stitched_panoramas_have_errors_of_their_own() {
+        let mut world = World::chain(2, 0.2, 74);
+        let poses: Vec<_> =
+            world.scene().reconstruction.images.iter().map(|image| image.world_from_camera).collect();
+        let errors = ModelErrors::new(5e-4, vec![poses; 16]);
+        let added = |world: &World| {
+            let alone = |errors: Option<&ModelErrors>| {
+                let scene = Scene { errors, ..world.scene() };
+                let photo = world.queries()[0];
+                let found = crate::locate_single(&crate::SingleParams::default(), &scene, &photo, 1);
+                found.photo.covariance.expect("is localized").fixed_view::<3, 3>(0, 0).trace()
+            };
+            alone(Some(&errors)) - alone(None)
+        };
+        let plain = added(&world);
+        for camera in &mut world.scene_model.cameras {
+            *camera = camera.as_stitched().expect("a panorama");
+        }
+        let stitched = added(&world);
+        assert!(plain > 0.0 && stitched > 1.5 * plain, "{plain} {stitched}");
     }
 
     #[test]

@@ -199,6 +199,11 @@ impl ModelErrors {
         let changes = changed.into_iter().chain(self.own.drawn(model, image, draw));
         BearingField::new(self.shared_sigma_rad, image, draw).with_changes(changes)
     }
+
+    /// The errors of the bearings of a picture that is none of the model's images, but was taken as they were; by its number.
+    pub fn field_of_another(&self, number: u32, draw: u32) -> BearingField {
+        BearingField::new(self.shared_sigma_rad, ImageId(u32::MAX - number), draw)
+    }
 }
 
 /// The model by its aligned places but for the lengths that it holds, and each image's pose in it.

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    ImageId, PairGeometry, Reconstruction, ReconstructionPoint, TwoViewKind,
+    ImageId, PairGeometry, Reconstruction, ReconstructionImage, ReconstructionPoint, TwoViewKind,
     visibility::{is_in_image, is_same_view},
 };
 
@@ -282,8 +282,9 @@ pub fn assess(
     let disagreements = judged.into_values().filter(|(_, any_agrees)| !any_agrees);
     report.disagreements = disagreements.map(|(found, _)| found).collect();
     let links = strongest_links(n, |a, b| shared[a * n + b].max(shared[b * n + a]));
+    let spots = Groups::of_one_spot(&reconstruction.images);
     let heavy = report.disagreements.iter().filter(|pair| pair.is_heavy());
-    report.outvoted = heavy.filter_map(|pair| outvoted(pair, n, &links)).collect();
+    report.outvoted = heavy.filter_map(|pair| outvoted(pair, &spots, &links)).collect();
     for first in reconstruction.registered() {
         for second in reconstruction.registered().filter(|&second| second > first) {
             let (forth, back) = (first.index() * n + second.index(), second.index() * n + first.index());
@@ -315,11 +316,19 @@ const MIN_WEIGHT: f64 = 0.75;
 type LinkBetween = (usize, usize, usize);
 
 /// Images in groups that grow together, each by the number of its group.
+#[derive(Clone)]
 struct Groups(Vec<usize>);
 
 impl Groups {
     fn of_one_each(images: usize) -> Self {
         Self((0..images).collect())
+    }
+
+    /// Images that were turned on one spot, to which the mapper gives exactly one centre; they need not share any point.
+    fn of_one_spot(images: &[ReconstructionImage]) -> Self {
+        let center = |at: usize| images[at].world_from_camera.map(|pose| pose.translation);
+        let first = |at| (0..at).find(|&other| center(at).is_some() && center(other) == center(at));
+        Self((0..images.len()).map(|at| first(at).unwrap_or(at)).collect())
     }
 
     /// Makes the groups of two images one; `false` where they already are.
@@ -348,16 +357,20 @@ fn strongest_links(images: usize, points: impl Fn(usize, usize) -> usize) -> Vec
 }
 
 /// The pair with what holds its images together, where that is less.
-fn outvoted(pair: &PairDisagreement, images: usize, links: &[LinkBetween]) -> Option<OutvotedPair> {
+///
+/// Images of one spot stay together, but for a pair of them.
+fn outvoted(pair: &PairDisagreement, spots: &Groups, links: &[LinkBetween]) -> Option<OutvotedPair> {
     let (first, second) = (pair.first.index(), pair.second.index());
+    let images = spots.0.len();
+    let untied = if spots.are_one(first, second) { Groups::of_one_each(images) } else { spots.clone() };
     // The weakest link between the two is that with which the strongest ones first tie them.
-    let mut tied = Groups::of_one_each(images);
+    let mut tied = untied.clone();
     let weakest = links.iter().position(|&(a, b, _)| {
         tied.join(a, b);
         tied.are_one(first, second)
     })?;
     let held_by = links[weakest].2;
-    let mut tied = Groups::of_one_each(images);
+    let mut tied = untied;
     for (at, &(a, b, _)) in links.iter().enumerate() {
         if at != weakest {
             tied.join(a, b);
@@ -445,7 +458,7 @@ impl QualityReport {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{CameraId, Observation, ReconstructionImage, Rigid, TwoView};
+    use crate::{CameraId, Observation, Rigid, TwoView};
     use nalgebra::UnitQuaternion;
     use setloc_features::{Camera, CameraModel, Match};
 
@@ -526,9 +539,10 @@ mod tests {
         };
         let links = strongest_links(8, points);
         assert_eq!(links, [(0, 1, 400), (1, 2, 400), (3, 4, 400), (4, 5, 400), (2, 3, 60), (0, 6, 20)]);
+        let spots = Groups::of_one_each(8);
         let found = |first: u32, second: u32, matches: usize| {
             let (first, second) = (ImageId(first), ImageId(second));
-            outvoted(&PairDisagreement { first, second, matches, used: 0, rotation_deg: 0.0 }, 8, &links)
+            outvoted(&PairDisagreement { first, second, matches, used: 0, rotation_deg: 0.0 }, &spots, &links)
         };
         let across = found(1, 5, 300).expect("weighs more");
         assert_eq!((across.held_by, across.side), (60, [0, 1, 2, 6].map(ImageId).to_vec()));
@@ -536,6 +550,31 @@ mod tests {
         assert_eq!(found(0, 2, 250), None);
         // Of an image that nothing ties there is nothing to say.
         assert_eq!(found(0, 7, 300), None);
+    }
+
+    #[test]
+    fn images_of_one_spot_are_on_one_side_though_they_share_no_point() {
+        let images = [0.0, 0.0, 1.0, 2.0].map(|x| image("a", x));
+        let spots = Groups::of_one_spot(&images);
+        let links = strongest_links(4, |a, b| match (a, b) {
+            (0, 2) => 400,
+            (1, 2) => 45,
+            (2, 3) => 60,
+            _ => 0,
+        });
+        let found = |first: u32, second: u32| {
+            let (first, second) = (ImageId(first), ImageId(second));
+            outvoted(
+                &PairDisagreement { first, second, matches: 56, used: 0, rotation_deg: 27.0 },
+                &spots,
+                &links,
+            )
+        };
+        let across = found(1, 3).expect("weighs as much");
+        assert_eq!((across.held_by, across.side), (60, [0, 1, 2].map(ImageId).to_vec()));
+        assert_eq!(found(1, 2), None, "the first holds both to the second");
+        let within = found(0, 1).expect("one spot is what it contradicts");
+        assert_eq!((within.held_by, within.side), (45, [0, 2, 3].map(ImageId).to_vec()));
     }
 
     #[test]

@@ -91,10 +91,19 @@ impl Component<'_> {
                 }
                 let is_elsewhere = self.agrees_alone(&joint.model.photos, slot, depth) == Some(false);
                 match self.standpoint_agrees_alone(&joint.model.photos, slot, depth) {
-                    // The photos' own matches are evidence that the set's pose did not create.
+                    // The photos' own matches are evidence that the set's pose did not create, but no remedy for one that the
+                    // joint refinement left behind.
                     Some(true) => {
                         reasons.push("localized alone, it stands at the same place".to_owned());
-                        verdict = Verdict::Localized;
+                        if kept >= MIN_KEPT {
+                            verdict = Verdict::Localized;
+                        } else if let Some(alone) = self.localized_alone(slot) {
+                            reasons.push(
+                                "its place and how well that is known are those of the photo alone"
+                                    .to_owned(),
+                            );
+                            return (PhotoLocalization { reasons, ..alone.clone() }, false);
+                        }
                     }
                     Some(false) => {
                         let which = if is_elsewhere { "it" } else { "another photo of its standpoint" };
@@ -140,10 +149,14 @@ impl Component<'_> {
             || self.model.tells_camera_of(&[ImageId(photo as u32)])
     }
 
+    /// What the photo alone says, where it is localized.
+    fn localized_alone(&self, slot: usize) -> Option<&PhotoLocalization> {
+        Some(&self.evidence[self.members[slot]].photo).filter(|alone| alone.verdict == Verdict::Localized)
+    }
+
     /// Whether the photo stands at the same place when localized alone; `None` when it is not.
     fn agrees_alone(&self, joint: &[JointPhoto], slot: usize, depth: f64) -> Option<bool> {
-        let alone = &self.evidence[self.members[slot]].photo;
-        let own = alone.world_from_camera.filter(|_| alone.verdict == Verdict::Localized)?;
+        let own = self.localized_alone(slot)?.world_from_camera?;
         Some(same_pose(&joint[slot].world_from_camera, &own, depth))
     }
 
