@@ -5,6 +5,7 @@ mod distrust;
 mod hinges;
 mod hung;
 mod observations;
+mod ties;
 mod walls;
 
 use std::collections::BTreeMap;

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeSet;
 
-use super::hung::MIN_TIE;
+use super::ties::Ties;
 use super::{Component, Joint};
 use crate::verdict::weaker;
 use crate::{PhotoLocalization, Verdict};
@@ -41,12 +41,12 @@ impl Joint {
     }
 
     /// How much of the scene, and of what is seen from both sides, tells the scale beyond a hinge.
-    fn scale_support(&self, beyond: &Beyond, tracks: &[BTreeSet<usize>]) -> usize {
+    fn scale_support(&self, beyond: &Beyond, tracks: &[Vec<usize>]) -> usize {
         let is_beyond = |standpoint: &usize| beyond.slots.binary_search(standpoint).is_ok();
         let of_scene = |&slot: &usize| {
             self.direct[slot].len() + self.viewed[slot] + self.walls[slot] + self.met[slot].len()
         };
-        let crosses = |track: &&BTreeSet<usize>| {
+        let crosses = |track: &&Vec<usize>| {
             track.iter().any(is_beyond) && track.iter().any(|at| *at != beyond.hinge && !is_beyond(at))
         };
         let center = |slot: usize| self.model.photos[slot].world_from_camera.translation;
@@ -63,9 +63,11 @@ impl Component<'_> {
     /// Photos that see the scene themselves are where that says.
     pub(super) fn doubt_beyond_hinges(&self, joint: &mut Joint) -> Vec<(Beyond, usize)> {
         let standpoints: Vec<usize> = joint.model.photos.iter().map(|photo| photo.standpoint).collect();
-        let tracks: Vec<BTreeSet<usize>> = (0..self.model.points.len())
-            .map(|local| self.track(local).iter().map(|&(slot, _)| standpoints[slot]).collect())
-            .collect();
+        let seen_by = |local| {
+            let all: BTreeSet<usize> = self.track(local).iter().map(|&(slot, _)| standpoints[slot]).collect();
+            Vec::from_iter(all)
+        };
+        let tracks: Vec<Vec<usize>> = (0..self.model.points.len()).map(seen_by).collect();
         let mut doubtful = Vec::new();
         for mut beyond in beyond_hinges(&standpoints, &tracks, joint.main_standpoint()) {
             let support = joint.scale_support(&beyond, &tracks);
@@ -82,8 +84,7 @@ impl Component<'_> {
     fn has_length(&self, standpoints: &[usize], beyond: &Beyond) -> bool {
         let is_beyond = |slot: usize| beyond.slots.binary_search(&slot).is_ok();
         self.lengths().any(|([reference, from, to], length)| {
-            let ties = standpoints[from] == beyond.hinge && is_beyond(to) && !is_beyond(reference)
-                || standpoints[from] == beyond.hinge && is_beyond(reference) && !is_beyond(to);
+            let ties = standpoints[from] == beyond.hinge && is_beyond(to) != is_beyond(reference);
             ties && length.votes >= self.params.verdict.min_inliers
         })
     }
@@ -103,34 +104,19 @@ impl Component<'_> {
 }
 
 /// What only one standpoint ties to the main one, or, where that is the main one, to the rest: for each such hinge the photos of each
-/// part beyond it. `tracks` are the standpoints that see each local point.
-fn beyond_hinges(standpoints: &[usize], tracks: &[BTreeSet<usize>], main: usize) -> Vec<Beyond> {
+/// part beyond it. `tracks` are the standpoints that see each local point, each once.
+fn beyond_hinges(standpoints: &[usize], tracks: &[Vec<usize>], main: usize) -> Vec<Beyond> {
     let count = standpoints.len();
-    let mut shared = vec![vec![0_usize; count]; count];
-    for track in tracks {
-        for &a in track {
-            for &b in track {
-                shared[a][b] += 1;
-            }
-        }
-    }
+    let ties = Ties::new(count, tracks);
     let all: BTreeSet<usize> = standpoints.iter().copied().collect();
     let mut found = Vec::new();
     for &hinge in &all {
         let mut left: BTreeSet<usize> = all.iter().copied().filter(|&at| at != hinge).collect();
         while let Some(first) = left.pop_first() {
-            let (mut part, mut waiting) = (BTreeSet::from([first]), vec![first]);
-            while let Some(at) = waiting.pop() {
-                let tied: Vec<usize> =
-                    left.iter().copied().filter(|&other| shared[at][other] >= MIN_TIE).collect();
-                for other in tied {
-                    left.remove(&other);
-                    part.insert(other);
-                    waiting.push(other);
-                }
-            }
-            if !part.contains(&main) {
-                let slots = (0..count).filter(|&slot| part.contains(&standpoints[slot])).collect();
+            let part = ties.reached(first, |a, b| a == hinge || b == hinge);
+            left.retain(|&at| !part[at]);
+            if !part[main] {
+                let slots = (0..count).filter(|&slot| part[standpoints[slot]]).collect();
                 found.push(Beyond { hinge, slots });
             }
         }
@@ -146,7 +132,7 @@ mod tests {
     fn what_one_standpoint_alone_ties_lies_beyond_it() {
         // Photos 0 and 1 of one standpoint, 2 and 3 with them, and 4 and 5 with 3 alone.
         let standpoints = [0, 0, 2, 3, 4, 5];
-        let track = |seen: &[usize], times: usize| vec![seen.iter().copied().collect::<BTreeSet<_>>(); times];
+        let track = |seen: &[usize], times: usize| vec![seen.to_vec(); times];
         let tracks =
             [track(&[0, 2, 3], 9), track(&[3, 4], 20), track(&[4, 5], 20), track(&[3, 5], 8)].concat();
         let beyond = |hinge, slots: &[usize]| Beyond { hinge, slots: slots.to_vec() };

@@ -3,10 +3,8 @@
 use nalgebra::Matrix6;
 use setloc_sfm::{BaselineLength, ImageId, Rigid};
 
+use super::ties::Ties;
 use super::{Component, Joint, standpoint};
-
-/// Local points that tie two photos.
-pub(super) const MIN_TIE: usize = 8;
 
 /// A pair of photos whose length planes tell.
 pub(super) struct Hung {
@@ -128,27 +126,12 @@ impl Component<'_> {
 
     /// The photos that no common points tie to the reference but through the pair.
     fn beyond(&self, standpoints: &[usize], slots: [usize; 3]) -> Vec<bool> {
-        let mut shared = vec![vec![0_usize; standpoints.len()]; standpoints.len()];
-        for local in 0..self.model.points.len() {
-            let track = self.track(local);
-            for &(a, _) in &track {
-                for &(b, _) in &track {
-                    shared[standpoints[a]][standpoints[b]] += 1;
-                }
-            }
-        }
+        let tracks = (0..self.model.points.len()).map(|local| {
+            self.track(local).into_iter().map(|(slot, _)| standpoints[slot]).collect::<Vec<_>>()
+        });
+        let ties = Ties::new(standpoints.len(), tracks);
         let [reference, from, to] = slots.map(|slot| standpoints[slot]);
-        let mut reached = vec![false; standpoints.len()];
-        let mut waiting = vec![reference];
-        while let Some(at) = waiting.pop() {
-            if std::mem::replace(&mut reached[at], true) {
-                continue;
-            }
-            let is_pair = |other: usize| (at == from && other == to) || (at == to && other == from);
-            waiting.extend(
-                (0..standpoints.len()).filter(|&other| shared[at][other] >= MIN_TIE && !is_pair(other)),
-            );
-        }
+        let reached = ties.reached(reference, |a, b| [a, b] == [from, to] || [a, b] == [to, from]);
         standpoints.iter().map(|&standpoint| !reached[standpoint]).collect()
     }
 
