@@ -75,8 +75,8 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// depth are held by parallax. 43: points of a grown scene shift to where moved rays meet. 44: stretched photos go on from where they
 /// are refined to. 45: and are twisted. 46: as the scene's panoramas are. 47: scales that few matches give.
 /// 48: photos among stitched panoramas err as these do; photos that the
-/// joint refinement leaves behind are where they are alone.
-pub const VERSION: u32 = 48;
+/// joint refinement leaves behind are where they are alone. 49: sets whose photos look otherwise than the scene are uncertain.
+pub const VERSION: u32 = 49;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 /// 2: points shift to where moved rays meet.

@@ -11,8 +11,13 @@ use setloc_sfm::ImageId;
 pub enum Picture {
     /// A photo, by its index.
     Photo(usize),
-    /// An image of the scene.
-    Scene(ImageId),
+    /// An image of a component of the scene.
+    Scene {
+        /// The component.
+        component: usize,
+        /// The image.
+        image: ImageId,
+    },
 }
 
 type Source = dyn Fn(Picture) -> Option<Arc<ImagePyramid>> + Send + Sync;

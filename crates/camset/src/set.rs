@@ -62,7 +62,7 @@ fn answer<E>(
     if by_points.set.refined.iter().all(|photo| photo.verdict == Verdict::Localized) {
         return Ok(by_points);
     }
-    let views = views()?;
+    let views = Views { pictures: local_models.pictures.cloned().unwrap_or_default(), ..views()? };
     if views.matches.is_empty() && !(params.scale_by_walls && views.pictures.are_some()) {
         return Ok(by_points);
     }
@@ -184,7 +184,9 @@ fn locate_by(
             *photo_links.entry(pair).or_default() += shared;
         }
         let seed = seed.wrapping_add(0x1000 * (number as u64 + 1));
-        let component = Component { params, scene, photos, evidence, model, members: &members, views };
+        let pictures = local_models.pictures;
+        let component =
+            Component { params, scene, photos, evidence, model, members: &members, views, pictures };
         match component.locate(seed) {
             ComponentAnswer::Localized(mut found) => {
                 let outvoted = local_models.outvoted.get(number).map_or(&[][..], Vec::as_slice);

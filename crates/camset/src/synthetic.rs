@@ -60,6 +60,14 @@ impl Place {
         Self { positions, descriptors }
     }
 
+    /// The same place with flat walls so far from its middle.
+    pub fn flat(mut self, distance: f64) -> Self {
+        for position in &mut self.positions {
+            position.x = distance.copysign(position.x);
+        }
+        self
+    }
+
     /// The same place as paving: all points on the ground between the walls, but those of this share.
     pub fn paved(mut self, standing: f64, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);

@@ -6,7 +6,7 @@ use setloc_sfm::{
     ImageId, ModelErrors, OutvotedPair, PairGeometry, PointId, Reconstruction, Rigid, Similarity,
 };
 
-use crate::PathToScene;
+use crate::{PathToScene, Pictures};
 
 /// One component of a built scene, borrowed.
 #[derive(Debug, Clone, Copy)]
@@ -72,7 +72,7 @@ pub struct QueryPhoto<'a> {
     pub features: &'a ImageFeatures,
 }
 
-/// What a set's photos tell of each other.
+/// What a set's photos tell of each other, and where their pixels are.
 #[derive(Debug, Clone, Copy)]
 pub struct LocalModels<'a> {
     /// Components of the set's reconstruction; image `i` of each is photo `i`.
@@ -81,11 +81,13 @@ pub struct LocalModels<'a> {
     pub open: &'a [PairGeometry],
     /// Verified pairs of photos that weigh against what holds each component together between them; none where it ends.
     pub outvoted: &'a [Vec<OutvotedPair>],
+    /// Pixels of the photos and of the scene's images, as far as they are at hand.
+    pub pictures: Option<&'a Pictures>,
 }
 
 impl<'a> From<&'a [Reconstruction]> for LocalModels<'a> {
     fn from(components: &'a [Reconstruction]) -> Self {
-        Self { components, open: &[], outvoted: &[] }
+        Self { components, open: &[], outvoted: &[], pictures: None }
     }
 }
 

@@ -52,7 +52,7 @@ pub struct Views {
     pub geometries: Vec<ViewGeometry>,
     /// Matches of each photo that passed the ratio test, verified or not.
     pub putative: Vec<usize>,
-    /// Pixels of both, to tell a scale that the matches do not.
+    /// Pixels of both, to tell a scale that the matches do not; set by whoever locates the set.
     pub pictures: Pictures,
 }
 

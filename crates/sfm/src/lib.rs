@@ -16,6 +16,7 @@ mod quality;
 mod reconstruction;
 pub mod robust;
 pub mod solvers;
+mod surfaces;
 pub mod synthetic;
 mod two_view;
 mod visibility;
@@ -38,5 +39,6 @@ pub use reconstruction::{
     AlignedTrack, BaselineLength, CameraId, ImageId, Observation, Place, PointId, Reconstruction,
     ReconstructionImage, ReconstructionPoint, StepPose,
 };
+pub use surfaces::{Likeness, PlacedPhoto, SurfacePlace, likeness_of, places_on_surfaces};
 pub use two_view::{PairGeometry, TWO_VIEW_VERSION, TwoView, TwoViewKind, TwoViewParams, verify_pair};
 pub use walls::{DistantPhoto, ScaleByWalls, WallSight, scale_by_walls};

@@ -1,4 +1,4 @@
-//! The scale of photos by the walls that they show, on rendered ones.
+//! The scale of photos by the walls that they show, and whether they show them, on rendered ones.
 
 #![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
 
@@ -7,8 +7,8 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, UnitQuaternion, Vector2, Vector3};
 use setloc_features::{Camera, CameraModel, GreyImage, ImagePyramid};
 use setloc_sfm::{
-    CameraId, DistantPhoto, ImageId, Observation, Reconstruction, ReconstructionImage, ReconstructionPoint,
-    Rigid, ScaleByWalls, scale_by_walls,
+    CameraId, DistantPhoto, ImageId, Likeness, Observation, PlacedPhoto, Reconstruction, ReconstructionImage,
+    ReconstructionPoint, Rigid, ScaleByWalls, likeness_of, places_on_surfaces, scale_by_walls,
 };
 
 /// A wall ten units ahead, with a niche that stands back.
@@ -66,15 +66,19 @@ fn at(center: [f64; 3], turn: f64) -> Rigid {
     Rigid::new(UnitQuaternion::from_axis_angle(&Vector3::y_axis(), turn), Vector3::from(center))
 }
 
-/// The scene of three panoramas that see a lattice of points of the wall.
-fn scene() -> Reconstruction {
+/// The scene of three panoramas that see a lattice of points of the wall, sixteen in a row, that many units apart.
+fn scene(spacing: f64) -> Reconstruction {
     let images = CENTERS.iter().enumerate().map(|(number, &center)| ReconstructionImage {
         name: number.to_string(),
         camera: CameraId(0),
         world_from_camera: Some(at(center, 0.0)),
     });
     let point = |number: u32| ReconstructionPoint {
-        position: Vector3::new(f64::from(number % 16) * 1.6 - 12.0, f64::from(number / 16) - 2.5, 10.0),
+        position: Vector3::new(
+            (f64::from(number % 16) - 7.5) * spacing,
+            (f64::from(number / 16) - 2.5) * spacing / 1.6,
+            10.0,
+        ),
         track: (0..3).map(|image| Observation { image: ImageId(image), feature: number }).collect(),
         color: [0; 3],
         error_sigma: 1.0,
@@ -91,7 +95,7 @@ fn scene() -> Reconstruction {
 
 /// What photos of one street tell in the scene of another, and the true scale.
 fn sought(seeds: [u32; 2]) -> (ScaleByWalls, f64) {
-    let (scene, scale) = (scene(), 2.5);
+    let (scene, scale) = (scene(1.6), 2.5);
     let [of_scene, of_photos] = seeds.map(|seed| Street { seed });
     let camera = Camera {
         model: CameraModel::Pinhole,
@@ -139,7 +143,7 @@ fn no_scale_stands_out_before_another_wall() {
 
 #[test]
 fn without_pixels_or_walls_there_is_none() {
-    let scene = scene();
+    let scene = scene(1.6);
     let none = |scene: &Reconstruction, images: &[ImageId]| {
         let pixels = |_| None;
         scale_by_walls(scene, images, |_| Matrix3::identity(), pixels, &Vector3::zeros(), &[]).is_none()
@@ -147,4 +151,42 @@ fn without_pixels_or_walls_there_is_none() {
     assert!(
         none(&scene, &[ImageId(0)]) && none(&scene, &[]) && none(&Reconstruction::default(), &[ImageId(3)])
     );
+}
+
+/// How much of what a photo of one wall shows at such points looks as in the images of another.
+fn likeness(seeds: [u32; 2], is_shown: impl Fn(&Vector3<f64>) -> bool) -> Likeness {
+    let scene = scene(0.25);
+    let [of_scene, of_photo] = seeds.map(|seed| Street { seed });
+    let camera = Camera {
+        model: CameraModel::Pinhole,
+        width: 640,
+        height: 480,
+        params: vec![300.0, 300.0, 320.0, 240.0],
+    };
+    // A tenth of a degree off, as poses are.
+    let (pose, taken_from) = (at([0.5, 0.0, 2.0], 0.1017), at([0.5, 0.0, 2.0], 0.1));
+    let photo = PlacedPhoto { camera: &camera, world_from_camera: pose };
+    let shown: Vec<Vector3<f64>> = (0..200)
+        .map(|number| {
+            Vector3::new(f64::from(number % 20) * 0.19 - 1.9, f64::from(number / 20) * 0.13 - 0.6, 10.1)
+        })
+        .chain((0..50).map(|number| Vector3::new(f64::from(number) * 0.04 - 1.0, 0.0, 6.0)))
+        .filter(is_shown)
+        .collect();
+    let places = places_on_surfaces(&scene, &photo, &shown);
+    let pose_of = |image: ImageId| scene.images[image.index()].world_from_camera.unwrap();
+    let load = |image: ImageId| Some(of_scene.picture(scene.camera_of(image), &pose_of(image)));
+    likeness_of(&scene, (&photo, &of_photo.picture(&camera, &taken_from)), &places, load)
+}
+
+#[test]
+fn a_photo_of_a_wall_looks_as_the_scene_s_images_and_one_of_another_wall_does_not() {
+    let right = likeness([1, 1], |_| true);
+    assert!(right.compared > 150 && right.share() > 0.9, "{right:?}");
+    // What is in front of the wall is on no surface of the scene.
+    assert!(right.compared <= 200, "{right:?}");
+    let wrong = likeness([1, 2], |_| true);
+    assert!(wrong.compared > 150 && wrong.share() < 0.2, "{wrong:?}");
+    assert_eq!(likeness([1, 1], |_| false), Likeness::default());
+    assert_eq!(likeness([1, 1], |spot| spot.z < 10.0), Likeness::default());
 }

@@ -4,6 +4,7 @@ mod answers;
 mod distrust;
 mod hinges;
 mod hung;
+mod looks;
 mod observations;
 mod ties;
 mod walls;
@@ -35,7 +36,8 @@ use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_support, weaker};
 use crate::{
-    CamsetParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, Verdict, Views,
+    CamsetParams, PhotoLocalization, Pictures, QueryPhoto, Scene, SceneMatch, SingleLocalization, Verdict,
+    Views,
 };
 
 /// Correspondences in a minimal sample of the generalized pose with scale.
@@ -97,6 +99,8 @@ pub(crate) struct Component<'a> {
     pub members: &'a [usize],
     /// What the photos share with images of the scene beside its points.
     pub views: &'a Views,
+    /// Pixels of both.
+    pub pictures: Option<&'a Pictures>,
 }
 
 /// What a local model and the scene show alike.
@@ -266,6 +270,13 @@ impl Component<'_> {
         let (mut refined, mut elsewhere_alone) =
             self.refined_answers(&candidates, &rigid, &joint, support, &reasons);
         self.doubt_photos(&doubtful, &mut refined);
+        if let Some(reason) = self.looks_otherwise(&joint) {
+            for photo in &mut refined {
+                photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
+                photo.reasons.push(reason.clone());
+            }
+            reasons.push(reason);
+        }
         let is_distrusted = is_distrusted(&joint.model.photos, &elsewhere_alone);
         let mut without_scale = Vec::new();
         if has_scale

@@ -110,9 +110,10 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
     let queries: Vec<QueryPhoto<'_>> =
         features.iter().map(|(photo, features)| query(photo, features)).collect();
     let photos: Vec<&SourceImage> = features.iter().map(|(photo, _)| *photo).collect();
-    let pictures = PicturesAtHand::new(&what.pictures, &photos);
     let empty = EmptyScene::default();
     let components = components_of(&what.scene, &empty);
+    let at_hand = PicturesAtHand::new(&what.pictures, &photos);
+    let pictures = at_hand.of(&components);
     let seed = derived_seed(what.seed, &["camset"]);
     let views = |scene: &Scene<'_>, alone: &[&SingleLocalization]| -> Result<Views> {
         let likely = likely_images(scene, alone, what.config.camset.views.max_images);
@@ -122,15 +123,18 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
         };
         let features = (0..scene.reconstruction.images.len()).map(read).collect::<Result<Vec<_>>>()?;
         let pairs = (&what.config.matching, &what.config.two_view);
-        let views = match_views(&what.config.camset.views, pairs, scene, features, &likely, &queries, seed);
-        Ok(Views { pictures: pictures.of(scene), ..views })
+        Ok(match_views(&what.config.camset.views, pairs, scene, features, &likely, &queries, seed))
     };
-    let models =
-        LocalModels { components: &model.components, open: &model.open_pairs, outvoted: &model.outvoted };
+    let models = LocalModels {
+        components: &model.components,
+        open: &model.open_pairs,
+        outvoted: &model.outvoted,
+        pictures: Some(&pictures),
+    };
     let params = &what.config.camset;
     let mut located: SetLocalization =
         locate_set_anywhere(params, &components, &queries, &alone, models, views, seed)?;
-    located.advice.extend(pictures.failures());
+    located.advice.extend(at_hand.failures());
     Product::new(located)
 }
 

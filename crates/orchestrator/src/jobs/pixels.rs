@@ -1,5 +1,6 @@
 //! Pixels of photos and of a scene's images, read when they are asked for.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -28,16 +29,20 @@ impl PicturesAtHand {
         }
     }
 
-    /// Those of one component of the scene; none where none of its images is at hand.
-    pub fn of(&self, scene: &Scene<'_>) -> Pictures {
-        let images = &scene.reconstruction.images;
-        let file = |at: usize| {
-            let file = self.book.get(&images[at].name)?;
-            let wraps = scene.reconstruction.cameras[images[at].camera.index()].wraps_around();
-            Some((file.path.clone(), file.hash, wraps))
+    /// Theirs and those of a scene's components; none where none of its images is at hand.
+    pub fn of(&self, components: &[Scene<'_>]) -> Pictures {
+        let files_of = |scene: &Scene<'_>| -> Vec<Option<(PathBuf, ContentHash, bool)>> {
+            let images = &scene.reconstruction.images;
+            let file = |at: usize| {
+                let file = self.book.get(&images[at].name)?;
+                let wraps = scene.reconstruction.cameras[images[at].camera.index()].wraps_around();
+                Some((file.path.clone(), file.hash, wraps))
+            };
+            (0..images.len()).map(file).collect()
         };
-        let files: Vec<Option<(PathBuf, ContentHash, bool)>> = (0..images.len()).map(file).collect();
-        if files.iter().all(Option::is_none) {
+        let files: BTreeMap<usize, Vec<_>> =
+            components.iter().map(|scene| (scene.component, files_of(scene))).collect();
+        if files.values().flatten().all(Option::is_none) {
             return Pictures::default();
         }
         let (photos, pyramids) = (self.photos.clone(), Arc::clone(&self.pyramids));
@@ -45,8 +50,8 @@ impl PicturesAtHand {
         Pictures::new(move |picture| {
             let (path, hash, wraps) = match picture {
                 Picture::Photo(at) => photos.get(at).map(|(path, hash)| (path, *hash, false))?,
-                Picture::Scene(image) => {
-                    let (path, hash, wraps) = files.get(image.index())?.as_ref()?;
+                Picture::Scene { component, image } => {
+                    let (path, hash, wraps) = files.get(&component)?.get(image.index())?.as_ref()?;
                     (path, *hash, *wraps)
                 }
             };
@@ -112,13 +117,14 @@ mod tests {
             errors: None,
         };
         let at_hand = PicturesAtHand::new(&book, &[&kept]);
-        let pictures = at_hand.of(&scene);
+        let pictures = at_hand.of(&[scene]);
         let is_there = |picture| pictures.get(picture).is_some();
+        let of_scene = |at| Picture::Scene { component: 0, image: ImageId(at) };
         assert!(is_there(Picture::Photo(0)) && !is_there(Picture::Photo(1)));
-        assert_eq!([0, 1, 2, 3].map(|at| is_there(Picture::Scene(ImageId(at)))), [true, false, false, false]);
+        assert_eq!([0, 1, 2, 3].map(|at| is_there(of_scene(at))), [true, false, false, false]);
         let [failure] = &at_hand.failures()[..] else { panic!("{:?}", at_hand.failures()) };
         assert!(failure.contains("b.png is not looked at"), "{failure}");
         // Without any of the scene's images there is nothing to lay photos over.
-        assert!(!PicturesAtHand::new(&Arc::default(), &[&kept]).of(&scene).are_some());
+        assert!(!PicturesAtHand::new(&Arc::default(), &[&kept]).of(&[scene]).are_some());
     }
 }

@@ -28,10 +28,15 @@ pub(crate) struct Piece {
     pub template: Template,
 }
 
+/// Pixels of a patch's step in images of a camera.
+pub(crate) fn step_px(camera: &Camera) -> f64 {
+    (f64::from(camera.width) / REFERENCE_WIDTH).max(1.0)
+}
+
 impl View<'_> {
     /// Pixels of a patch's step.
     pub fn step_px(&self) -> f64 {
-        (f64::from(self.camera.width) / REFERENCE_WIDTH).max(1.0)
+        step_px(self.camera)
     }
 
     /// Patches with texture at bearings that `wanted` takes, row by row.

@@ -68,7 +68,7 @@ impl Component<'_> {
             self.scene.reconstruction,
             &self.images_of(joint, main),
             |point| self.scene.index.position_covariance(point),
-            |image| pictures.get(Picture::Scene(image)),
+            |image| pictures.get(Picture::Scene { component: self.scene.component, image }),
             &at_main.translation,
             &photos,
         )?;
