@@ -48,7 +48,7 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 15);
+serde_artifact!(SceneFile, "scene", 16);
 
 /// Altitude of an origin where none was measured: heights are relative. A measured zero is positive.
 pub const NO_ALTITUDE: f64 = -0.0;

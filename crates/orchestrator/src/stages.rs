@@ -39,8 +39,8 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// errors its images share. 14: and how these change the stretch of panoramas. 15: adjusted in fewer steps. 16: to first order.
 /// 17: what it may be off by its points' residuals, too. 18: warns of what is hardly held. 19: other signs. 20: in the hash of
 /// what localization depends on. 22: says of parts joined across walls why. 23: adjusted to measured positions, too.
-/// 24: panoramas twist directions, too. 25: each a little by its own.
-pub const SCENE_VERSION: u32 = 25;
+/// 24: panoramas twist directions, too. 25: each a little by its own. 26: says how their windows are stretched.
+pub const SCENE_VERSION: u32 = 26;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
 /// Version of set localization.

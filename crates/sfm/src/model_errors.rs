@@ -21,9 +21,11 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use setloc_features::Camera;
 
+mod local;
 mod shared;
 mod stitching;
 
+use self::local::LocalStretch;
 pub use self::shared::BearingField;
 use self::shared::shared_sigma_rad;
 use self::stitching::{OwnCameras, SharedStitching, draw_priors, move_places};
@@ -46,6 +48,7 @@ const LOSS: RobustLoss = RobustLoss::Cauchy(1.0);
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ModelErrors {
     shared_sigma_rad: f64,
+    local_stretch: LocalStretch,
     /// Poses by draw, then by image.
     poses: Vec<Vec<Option<Rigid>>>,
     /// The model's cameras by draw; none where no draw changes any.
@@ -142,12 +145,13 @@ impl ModelErrors {
         if !model.cameras.iter().any(Camera::is_stretched) {
             cameras.clear();
         }
-        Some(Self { shared_sigma_rad, poses, cameras, own })
+        Some(Self { shared_sigma_rad, local_stretch: LocalStretch::of(model), poses, cameras, own })
     }
 
     /// Draws of poses, by draw and image, whose bearings share errors of this standard deviation.
     pub fn new(shared_sigma_rad: f64, poses: Vec<Vec<Option<Rigid>>>) -> Self {
-        Self { shared_sigma_rad, poses, cameras: Vec::new(), own: OwnCameras::default() }
+        let (local_stretch, own) = (LocalStretch::default(), OwnCameras::default());
+        Self { shared_sigma_rad, local_stretch, poses, cameras: Vec::new(), own }
     }
 
     /// Standard deviation of what neighbouring bearings share, per tangent axis, in radians; 0 where residuals show none.
@@ -200,9 +204,12 @@ impl ModelErrors {
         BearingField::new(self.shared_sigma_rad, image, draw).with_changes(changes)
     }
 
-    /// The errors of the bearings of a picture that is none of the model's images, but was taken as they were; by its number.
+    /// The errors of the bearings of a picture along z that is none of the model's images, but was cut from one taken as they were; by its
+    /// number.
     pub fn field_of_another(&self, number: u32, draw: u32) -> BearingField {
-        BearingField::new(self.shared_sigma_rad, ImageId(u32::MAX - number), draw)
+        let mut rng = ChaCha8Rng::seed_from_u64(u64::from(number) << 32 | u64::from(draw) | 1 << 31);
+        let stretch = self.local_stretch.drawn([(); 3].map(|()| normal(&mut rng)));
+        BearingField::new(self.shared_sigma_rad, ImageId(u32::MAX - number), draw).with_stretch(stretch)
     }
 }
 

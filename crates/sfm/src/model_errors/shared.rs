@@ -6,7 +6,7 @@
 //! keypoints. How large these errors are, residuals of neighbouring points show: where noise is independent, their products are
 //! zero in the mean.
 
-use nalgebra::{Vector2, Vector3};
+use nalgebra::{Matrix3, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use setloc_features::Camera;
@@ -39,6 +39,8 @@ const LENGTH_RAD: f64 = 0.12;
 #[derive(Debug, Clone)]
 pub struct BearingField {
     waves: Vec<Wave>,
+    /// What is added to a bearing, linear in it.
+    stretch: Matrix3<f64>,
     /// Cameras and what they are in the draw.
     changes: Vec<[Camera; 2]>,
 }
@@ -54,7 +56,7 @@ impl BearingField {
     /// One of errors of this standard deviation per tangent axis.
     pub(super) fn new(sigma_rad: f64, image: ImageId, draw: u32) -> Self {
         if sigma_rad == 0.0 {
-            return Self { waves: Vec::new(), changes: Vec::new() };
+            return Self { waves: Vec::new(), stretch: Matrix3::zeros(), changes: Vec::new() };
         }
         let mut rng = ChaCha8Rng::seed_from_u64(u64::from(image.0) << 32 | u64::from(draw));
         let scale = sigma_rad * (2.0 / WAVES as f64).sqrt();
@@ -63,12 +65,17 @@ impl BearingField {
             let amplitude = Vector3::from_fn(|_, _| normal(&mut rng)) * scale;
             Wave { vector, phase: rng.random_range(0.0..std::f64::consts::TAU), amplitude }
         };
-        Self { waves: (0..WAVES).map(wave).collect(), changes: Vec::new() }
+        Self { waves: (0..WAVES).map(wave).collect(), stretch: Matrix3::zeros(), changes: Vec::new() }
     }
 
     /// The same with what changes of the camera add, from one to another each.
     pub(super) fn with_changes(self, changes: impl IntoIterator<Item = [Camera; 2]>) -> Self {
         Self { changes: changes.into_iter().collect(), ..self }
+    }
+
+    /// The same of a picture that is stretched so besides.
+    pub(super) fn with_stretch(self, stretch: Matrix3<f64>) -> Self {
+        Self { stretch, ..self }
     }
 
     /// The error of a bearing of unit length in the camera frame, across it.
@@ -77,6 +84,7 @@ impl BearingField {
         let mut sum: Vector3<f64> = self.waves.iter().map(of_wave).sum();
         let changed = |[own, drawn]: &[Camera; 2]| Some(drawn.unproject(&own.project(bearing)?)? - bearing);
         sum += self.changes.iter().filter_map(changed).sum::<Vector3<f64>>();
+        sum += self.stretch * bearing;
         sum - bearing * bearing.dot(&sum)
     }
 
