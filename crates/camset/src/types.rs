@@ -6,7 +6,7 @@ use setloc_sfm::{
     ImageId, ModelErrors, OutvotedPair, PairGeometry, PointId, Reconstruction, Rigid, Similarity,
 };
 
-use crate::{PathToScene, Pictures};
+use crate::{PathToScene, Pictures, verdict::weaker};
 
 /// One component of a built scene, borrowed.
 #[derive(Debug, Clone, Copy)]
@@ -145,6 +145,12 @@ pub struct PhotoLocalization {
 }
 
 impl PhotoLocalization {
+    /// Makes it uncertain at best, for this reason.
+    pub(crate) fn doubt(&mut self, reason: String) {
+        self.verdict = weaker(self.verdict, Verdict::Uncertain);
+        self.reasons.push(reason);
+    }
+
     /// The answer "not localized" in a component, for one reason.
     pub fn not_localized(photo: &QueryPhoto<'_>, component: usize, reason: impl Into<String>) -> Self {
         Self {

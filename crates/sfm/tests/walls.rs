@@ -93,16 +93,16 @@ fn scene(spacing: f64) -> Reconstruction {
     }
 }
 
+fn pinhole(focal: f64) -> Camera {
+    let params = vec![focal, focal, 320.0, 240.0];
+    Camera { model: CameraModel::Pinhole, width: 640, height: 480, params }
+}
+
 /// What photos of one street tell in the scene of another, and the true scale.
 fn sought(seeds: [u32; 2]) -> (ScaleByWalls, f64) {
     let (scene, scale) = (scene(1.6), 2.5);
     let [of_scene, of_photos] = seeds.map(|seed| Street { seed });
-    let camera = Camera {
-        model: CameraModel::Pinhole,
-        width: 640,
-        height: 480,
-        params: vec![500.0, 500.0, 320.0, 240.0],
-    };
+    let camera = pinhole(500.0);
     let place = Vector3::new(0.5, 0.0, -1.0);
     let photo = |step: [f64; 3], turn: f64| {
         let pose = at((place + Vector3::from(step) * scale).into(), turn);
@@ -157,12 +157,7 @@ fn without_pixels_or_walls_there_is_none() {
 fn likeness(seeds: [u32; 2], is_shown: impl Fn(&Vector3<f64>) -> bool) -> Likeness {
     let scene = scene(0.25);
     let [of_scene, of_photo] = seeds.map(|seed| Street { seed });
-    let camera = Camera {
-        model: CameraModel::Pinhole,
-        width: 640,
-        height: 480,
-        params: vec![300.0, 300.0, 320.0, 240.0],
-    };
+    let camera = pinhole(300.0);
     // A tenth of a degree off, as poses are.
     let (pose, taken_from) = (at([0.5, 0.0, 2.0], 0.1017), at([0.5, 0.0, 2.0], 0.1));
     let photo = PlacedPhoto { camera: &camera, world_from_camera: pose };

@@ -82,8 +82,7 @@ impl ComponentPoses {
     /// Makes a photo uncertain, for this reason.
     pub fn doubt(&mut self, slot: usize, reason: &str) {
         for photo in [&mut self.rigid[slot], &mut self.refined[slot]] {
-            photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
-            photo.reasons.push(reason.to_owned());
+            photo.doubt(reason.to_owned());
         }
     }
 }
@@ -272,8 +271,7 @@ impl Component<'_> {
         self.doubt_photos(&doubtful, &mut refined);
         if let Some(reason) = self.looks_otherwise(&joint) {
             for photo in &mut refined {
-                photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
-                photo.reasons.push(reason.clone());
+                photo.doubt(reason.clone());
             }
             reasons.push(reason);
         }

@@ -817,7 +817,7 @@ fn outweighs_walls(agreeing: usize, expected: f64, least: f64) -> bool {
 }
 
 /// The upper middle of the finite values.
-pub(super) fn median(mut values: Vec<f64>) -> Option<f64> {
+pub(crate) fn median(mut values: Vec<f64>) -> Option<f64> {
     values.retain(|value| value.is_finite());
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied()

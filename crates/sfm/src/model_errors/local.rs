@@ -10,14 +10,15 @@
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use setloc_features::Camera;
 
-use crate::{ImageId, Reconstruction};
+use super::shared::{Residual, residuals_of_images};
+use crate::{ImageId, Reconstruction, mapper::median};
 
 /// Directions of windows about the vertical, and their half width and height as tangents: a usual photo's.
 const WINDOWS: usize = 8;
 const HALF: [f64; 2] = [0.7, 0.52];
-/// Fewest views of a point, points of a window, and windows of a model.
-const MIN_VIEWS: usize = 3;
+/// Fewest points of a window, and windows of a model.
 const MIN_POINTS: usize = 60;
 const MIN_WINDOWS: usize = 12;
 /// Beforehand the stretch of a window may be so large.
@@ -60,18 +61,20 @@ struct Sight {
 impl LocalStretch {
     /// That of a model's stretched panoramas; none where it has none, or too few windows that tell.
     pub fn of(model: &Reconstruction) -> Self {
-        let windows: Vec<Window> = model
-            .registered()
-            .filter(|image| model.camera_of(*image).is_stretched())
-            .collect::<Vec<ImageId>>()
-            .par_iter()
-            .flat_map_iter(|&image| windows_of(model, image))
-            .collect();
+        if !model.cameras.iter().any(Camera::is_stretched) {
+            return Self::default();
+        }
+        let of_image = residuals_of_images(model);
+        let stretched = model.registered().filter(|image| model.camera_of(*image).is_stretched());
+        let stretched: Vec<ImageId> = stretched.collect();
+        let windows: Vec<Window> =
+            stretched.par_iter().flat_map_iter(|image| windows_of(&of_image[image.index()])).collect();
         let excess = |parameter: usize| {
-            let limit = MAX_SIGMA * median(windows.iter().map(|window| window.sigma[parameter]))?;
+            let limit = MAX_SIGMA * median(windows.iter().map(|window| window.sigma[parameter]).collect())?;
             let told = || windows.iter().filter(move |window| window.sigma[parameter] <= limit);
-            let shown = median(told().map(|window| window.stretch[parameter].powi(2)))? / MEDIAN_SQUARED;
-            let by_noise = median(told().map(|window| window.sigma[parameter].powi(2)))?;
+            let shown =
+                median(told().map(|window| window.stretch[parameter].powi(2)).collect())? / MEDIAN_SQUARED;
+            let by_noise = median(told().map(|window| window.sigma[parameter].powi(2)).collect())?;
             Some((shown - by_noise).max(0.0))
         };
         match [0, 1, 2].map(excess) {
@@ -92,35 +95,19 @@ fn stretch([focal, aspect, skew]: [f64; STRETCHES]) -> Matrix3<f64> {
     Matrix3::new(focal + aspect, skew, 0.0, skew, focal - aspect, 0.0, 0.0, 0.0, 0.0)
 }
 
-fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
-}
-
-fn windows_of(model: &Reconstruction, image: ImageId) -> Vec<Window> {
-    let Some(pose) = model.images[image.index()].world_from_camera else { return Vec::new() };
-    let camera_from_world = pose.inverse();
-    let camera = model.camera_of(image);
-    let mut seen: Vec<(Vector3<f64>, Vector3<f64>)> = Vec::new();
-    for point in model.points.iter().filter(|point| point.track.len() >= MIN_VIEWS) {
-        let Some(aligned) = &point.aligned else { continue };
-        let places = point.track.iter().zip(&aligned.places).filter(|(seen, _)| seen.image == image);
-        let at = camera_from_world.transform_point(&point.position);
-        seen.extend(places.filter_map(|(_, place)| Some((at, camera.unproject(&place.pixel)?))));
-    }
+/// The windows of a panorama that tell something, by what its points leave over.
+fn windows_of(residuals: &[Residual]) -> Vec<Window> {
     let window = |number: usize| {
         let (sin, cos) = (std::f64::consts::TAU * number as f64 / WINDOWS as f64).sin_cos();
         let axes = Matrix3::new(cos, 0.0, -sin, 0.0, 1.0, 0.0, sin, 0.0, cos);
-        let sight = |(at, bearing): &(Vector3<f64>, Vector3<f64>)| {
-            let (at, bearing) = (axes * at, axes * bearing);
+        let sight = |residual: &Residual| {
+            let (bearing, error) = (axes * residual.bearing, axes * residual.error);
             let is_inside = bearing.z > 0.0
                 && bearing.x.abs() < HALF[0] * bearing.z
                 && bearing.y.abs() < HALF[1] * bearing.z;
-            let expected = at.try_normalize(f64::EPSILON).filter(|_| is_inside)?;
-            Some(Sight { expected, error: bearing - expected, distance: at.norm() })
+            is_inside.then(|| Sight { expected: bearing - error, error, distance: residual.distance })
         };
-        let sights: Vec<Sight> = seen.iter().filter_map(sight).collect();
+        let sights: Vec<Sight> = residuals.iter().filter_map(sight).collect();
         (sights.len() >= MIN_POINTS).then(|| resected(&sights)).flatten()
     };
     (0..WINDOWS).filter_map(window).collect()
@@ -143,14 +130,14 @@ fn resected(sights: &[Sight]) -> Option<Window> {
     };
     let jacobians: Vec<SMatrix<f64, 3, UNKNOWNS>> = sights.iter().map(jacobian).collect();
     // Far points say as much of a centre as their distance allows: its steps are in median distances.
-    let unit = median(sights.iter().map(|sight| sight.distance))?;
+    let unit = median(sights.iter().map(|sight| sight.distance).collect())?;
     let mut solution = SVector::<f64, UNKNOWNS>::zeros();
     let mut sigma = [f64::INFINITY; STRETCHES];
     for _ in 0..ROUNDS {
         let left =
             |(sight, jacobian): (&Sight, &SMatrix<f64, 3, UNKNOWNS>)| sight.error - jacobian * solution;
         let residuals: Vec<Vector3<f64>> = sights.iter().zip(&jacobians).map(left).collect();
-        let noise = median(residuals.iter().map(Vector3::norm))? / MEDIAN_NORM;
+        let noise = median(residuals.iter().map(Vector3::norm).collect())? / MEDIAN_NORM;
         if !(noise > 0.0) {
             return None;
         }
@@ -176,16 +163,14 @@ fn resected(sights: &[Sight]) -> Option<Window> {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{UnitQuaternion, Vector2};
-    use rand::{Rng, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
-    use setloc_features::Camera;
-
     use super::*;
     use crate::synthetic::normal;
     use crate::{
         AlignedTrack, CameraId, Observation, Place, ReconstructionImage, ReconstructionPoint, Rigid,
     };
+    use nalgebra::{UnitQuaternion, Vector2};
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
 
     /// Panoramas at one place that see points ahead, behind and to both sides, each such direction stretched by itself.
     fn stretched(camera: &Camera, sigma: LocalStretch) -> Reconstruction {

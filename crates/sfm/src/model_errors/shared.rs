@@ -36,7 +36,7 @@ const LENGTH_RAD: f64 = 0.12;
 
 /// A smooth random field of bearing errors over the sphere, by random Fourier features (A. Rahimi, B. Recht, "Random
 /// features for large-scale kernel machines", NIPS 2007), and what changes of the camera add to it.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct BearingField {
     waves: Vec<Wave>,
     /// What is added to a bearing, linear in it.
@@ -56,7 +56,7 @@ impl BearingField {
     /// One of errors of this standard deviation per tangent axis.
     pub(super) fn new(sigma_rad: f64, image: ImageId, draw: u32) -> Self {
         if sigma_rad == 0.0 {
-            return Self { waves: Vec::new(), stretch: Matrix3::zeros(), changes: Vec::new() };
+            return Self::default();
         }
         let mut rng = ChaCha8Rng::seed_from_u64(u64::from(image.0) << 32 | u64::from(draw));
         let scale = sigma_rad * (2.0 / WAVES as f64).sqrt();
@@ -65,7 +65,7 @@ impl BearingField {
             let amplitude = Vector3::from_fn(|_, _| normal(&mut rng)) * scale;
             Wave { vector, phase: rng.random_range(0.0..std::f64::consts::TAU), amplitude }
         };
-        Self { waves: (0..WAVES).map(wave).collect(), stretch: Matrix3::zeros(), changes: Vec::new() }
+        Self { waves: (0..WAVES).map(wave).collect(), ..Self::default() }
     }
 
     /// The same with what changes of the camera add, from one to another each.
@@ -112,10 +112,12 @@ pub(super) fn shared_sigma_rad(model: &Reconstruction) -> f64 {
 }
 
 /// A residual of one point in one image.
-struct Residual {
-    bearing: Vector3<f64>,
+pub(super) struct Residual {
+    pub bearing: Vector3<f64>,
     /// Seen minus expected, across the bearing, in radians.
-    error: Vector3<f64>,
+    pub error: Vector3<f64>,
+    /// How far away the point is.
+    pub distance: f64,
     /// Share of an error's variance that the point does not take up.
     left: f64,
 }
@@ -127,12 +129,7 @@ struct Variances {
 }
 
 fn variances(model: &Reconstruction) -> Option<Variances> {
-    let mut of_image: Vec<Vec<Residual>> = model.images.iter().map(|_| Vec::new()).collect();
-    for point in model.points.iter().filter(|point| point.track.len() >= MIN_VIEWS) {
-        for (image, residual) in residuals(model, point) {
-            of_image[image.index()].push(residual);
-        }
-    }
+    let mut of_image = residuals_of_images(model);
     let mut sizes: Vec<f64> = of_image.iter().flatten().map(|residual| residual.error.norm()).collect();
     sizes.sort_by(f64::total_cmp);
     let largest = MAX_RESIDUAL * sizes.get(sizes.len() / 2)?;
@@ -175,6 +172,17 @@ impl Mean {
     }
 }
 
+/// What the points of three views and more leave over in each image.
+pub(super) fn residuals_of_images(model: &Reconstruction) -> Vec<Vec<Residual>> {
+    let mut of_image: Vec<Vec<Residual>> = model.images.iter().map(|_| Vec::new()).collect();
+    for point in model.points.iter().filter(|point| point.track.len() >= MIN_VIEWS) {
+        for (image, residual) in residuals(model, point) {
+            of_image[image.index()].push(residual);
+        }
+    }
+    of_image
+}
+
 /// What a point leaves over in the images of its track, where it has aligned places.
 fn residuals<'a>(
     model: &'a Reconstruction,
@@ -186,8 +194,9 @@ fn residuals<'a>(
     point.track.iter().zip(places).filter_map(move |(seen, place)| {
         let pose = model.images.get(seen.image.index())?.world_from_camera?;
         let bearing = model.camera_of(seen.image).unproject(&place.pixel)?;
-        let expected = pose.inverse().transform_point(&point.position).try_normalize(f64::EPSILON)?;
-        Some((seen.image, Residual { bearing, error: bearing - expected, left }))
+        let expected = pose.inverse().transform_point(&point.position);
+        let (distance, expected) = (expected.norm(), expected.try_normalize(f64::EPSILON)?);
+        Some((seen.image, Residual { bearing, error: bearing - expected, distance, left }))
     })
 }
 

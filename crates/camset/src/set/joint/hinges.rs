@@ -8,8 +8,7 @@ use std::collections::BTreeSet;
 
 use super::ties::Ties;
 use super::{Component, Joint};
-use crate::verdict::weaker;
-use crate::{PhotoLocalization, Verdict};
+use crate::PhotoLocalization;
 
 /// Standard deviation of a scale that few matches give, which are as likely chance as not, as a share of it. Of real sets such scales
 /// were 2, 5, 12 and 500 % off.
@@ -95,9 +94,7 @@ impl Component<'_> {
             let hinge = self.photos[self.members[beyond.hinge]].name;
             let matches = if *support == 1 { "match" } else { "matches" };
             for &slot in &beyond.slots {
-                let photo = &mut answers[slot];
-                photo.verdict = weaker(photo.verdict, Verdict::Uncertain);
-                photo.reasons.push(format!("how far it is from {hinge} rests on {support} {matches}"));
+                answers[slot].doubt(format!("how far it is from {hinge} rests on {support} {matches}"));
             }
         }
     }
