@@ -130,6 +130,11 @@ impl LeftApart {
     pub fn is_torn(&self) -> bool {
         2 * self.known_pairs < self.pairs
     }
+
+    /// Whether the model tells more than another of the same images does.
+    pub fn tells_more_than(&self, other: &Self) -> bool {
+        self.known_pairs > other.known_pairs
+    }
 }
 
 /// The index of each component, the largest first.

@@ -14,7 +14,7 @@ use crate::dataset::{ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Executor, JobGraph, RunResult};
-use crate::jobs::{LikelyJobs, SceneJobs, SceneModelJobs, add_first_model, add_scene};
+use crate::jobs::{ApartJob, LikelyJobs, SceneJobs, SceneModelJobs, add_first_model, add_scene};
 use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::stages::FeatureParams;
@@ -92,7 +92,7 @@ pub fn build_scene(
             first.images.len(),
             images.len()
         ));
-        pass = passes.pass(again, |second| second.known_pairs > first.known_pairs)?;
+        pass = passes.pass(again, |second| second.tells_more_than(first))?;
     }
     if let Pass::Left(..) = pass {
         session.note("no more images came together by that, and the first model stays".to_owned());
@@ -127,19 +127,24 @@ enum Pass {
 
 impl<Export: FnMut(&Built) -> Result<()>> Passes<'_, Export> {
     /// Builds a scene of these images, which stays if what its model leaves apart is such.
-    fn pass(&mut self, images: &[SourceImage], stays: impl FnOnce(&LeftApart) -> bool) -> Result<Pass> {
+    fn pass(
+        &mut self,
+        images: &[SourceImage],
+        stays: impl Fn(&LeftApart) -> bool + Send + Sync,
+    ) -> Result<Pass> {
         let SceneSource { folder, config, seed, name, present } = self.source;
         let mut graph = JobGraph::default();
         let jobs = add_scene(&mut graph, images, self.alike, config, seed)?;
         graph.want(jobs.scene);
         graph.want_file(jobs.scene);
-        graph.want(jobs.left_apart);
+        graph.want(jobs.apart.job);
+        jobs.finish_only_where(&mut graph, &stays);
         jobs.features.iter().for_each(|features| graph.want(*features));
         let (before, export) = (&self.run, &mut self.export);
         let use_results = |executor: &Executor<'_>, run: &RunResult| -> Result<Pass> {
-            if let Some(left) = executor.load_made::<LeftApart>(jobs.left_apart)?.filter(|left| !stays(left))
-            {
-                let again = jobs.looked_at_again(images, &left);
+            let left = executor.load_made::<LeftApart>(jobs.apart.job)?;
+            if let Some(left) = left.filter(|left| !stays(left)) {
+                let again = jobs.apart.looked_at_again(images, &left);
                 return Ok(Pass::Left((*left).clone(), again));
             }
             let run = &before.clone().and(run.clone());
@@ -155,24 +160,19 @@ impl<Export: FnMut(&Built) -> Result<()>> Passes<'_, Export> {
     }
 }
 
-/// The images of a scene's second pass, `None` where its model is not torn; what that takes is read where it is stored.
+/// What the model of a scene leaves apart, and the images for another pass; what that takes is read where it is stored.
 ///
 /// # Errors
 /// When the run was stopped or the store cannot be written.
-pub fn images_of_second_pass(
+pub fn left_apart(
     session: &Session,
     name: &str,
+    (graph, apart): (&JobGraph<'_>, &ApartJob),
     images: &[SourceImage],
-    alike: &[(usize, usize)],
-    config: &Config,
-    seed: u64,
-) -> Result<Option<Vec<SourceImage>>> {
-    let mut graph = JobGraph::default();
-    let jobs = add_scene(&mut graph, images, alike, config, seed)?;
-    graph.want(jobs.left_apart);
-    session.run(name, &graph, |executor, _| {
-        let left = executor.load_made::<LeftApart>(jobs.left_apart)?;
-        Ok(left.filter(|left| config.looks_again(left)).map(|left| jobs.looked_at_again(images, &left)))
+) -> Result<Option<(LeftApart, Vec<SourceImage>)>> {
+    session.run(name, graph, |executor, _| {
+        let left = executor.load_made::<LeftApart>(apart.job)?;
+        Ok(left.map(|left| ((*left).clone(), apart.looked_at_again(images, &left))))
     })
 }
 

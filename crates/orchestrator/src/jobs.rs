@@ -20,7 +20,7 @@ pub use locate::{LocateJobs, SetJobs, add_set, add_singles};
 pub use matching::{PairSource, add_turned};
 pub use model::{ModelJobs, ModelKind, add_model, divided_guesses};
 pub use pairs::choose_pairs;
-pub use scene::{SceneJobs, SceneModelJobs, add_first_model, add_scene};
+pub use scene::{ApartJob, SceneJobs, SceneModelJobs, add_first_model, add_model_apart, add_scene};
 
 use crate::fingerprint::ContentHash;
 

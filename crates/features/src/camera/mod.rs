@@ -336,6 +336,9 @@ impl Camera {
         if self.model == CameraModel::Equirectangular {
             return equirectangular::pixel_angle(&self.params, pixel);
         }
+        if self.is_stretched() {
+            return stitched::ray(&self.params, pixel).map(|(_, d_pixel)| pixel_angle(&d_pixel));
+        }
         self.unproject_with_jacobian(pixel).map(|ray| ray.pixel_angle())
     }
 

@@ -139,9 +139,22 @@ pub(super) fn ray(params: &[f64], pixel: &Vector2<f64>) -> Option<(Vector3<f64>,
 }
 
 /// The same for a plain ray.
+#[inline(always)]
 pub(super) fn ray_of_plain(params: &[f64], plain: &PlainRay) -> (Vector3<f64>, Matrix3x2<f64>) {
-    let ray = seen(params, plain).0;
-    (ray.bearing, ray.d_pixel)
+    let field = Field::of(params);
+    let twisted = field.twist * plain.bearing;
+    let ray = field.stretch * plain.bearing + plain.bearing.cross(&twisted);
+    let length = ray.norm();
+    let bearing = ray / length;
+    // Two directions cost less than the whole derivative.
+    let d_pixel = [0, 1].map(|at: usize| {
+        let by_pixel: Vector3<f64> = plain.d_pixel.column(at).into_owned();
+        let moved = field.stretch * by_pixel
+            + by_pixel.cross(&twisted)
+            + plain.bearing.cross(&(field.twist * by_pixel));
+        (moved - bearing * bearing.dot(&moved)) / length
+    });
+    (bearing, Matrix3x2::from_columns(&d_pixel))
 }
 
 /// The ray for a plain one, without its derivatives by the parameters of the sphere.

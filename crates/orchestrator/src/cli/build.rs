@@ -13,7 +13,7 @@ use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
 use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
 use crate::building::{
     BuildOutcome, Built, SceneSource, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras,
-    images_of_second_pass,
+    left_apart,
 };
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, unread_images};
@@ -21,7 +21,7 @@ use crate::error::Hinted;
 use crate::export::{Marker, colmap_lacks, ply, remove_colmap, renew_colmap, scene_json, top_view_png};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, Prediction};
-use crate::jobs::{LikelyJobs, add_first_model, add_scene};
+use crate::jobs::{LikelyJobs, add_first_model, add_model_apart, add_scene};
 use crate::pictures::PictureBook;
 use crate::print;
 use crate::scene::SceneFile;
@@ -162,7 +162,7 @@ fn stored_alike_pairs(
 }
 
 /// The jobs of the scene; where its cameras are a guess, those of the model that tells them as long as some of these are not
-/// stored. Where all are, and its model leaves images apart, those of the second pass.
+/// stored. Where its model is torn, those of the second pass, as long as that may tell more.
 fn next_jobs<'g>(
     args: &PlanArgs,
     folder: &ImageFolder,
@@ -183,14 +183,25 @@ fn next_jobs<'g>(
         told = estimate_cameras(&session()?, name, &folder.images, alike, config, seed)?.0;
     }
     let images = told.as_deref().unwrap_or(&folder.images);
+    let apart_where_stored = |images: &[SourceImage]| {
+        let mut graph = JobGraph::default();
+        let apart = add_model_apart(&mut graph, images, alike, config, seed)?;
+        graph.want(apart.job);
+        if !is_stored(&graph, store) {
+            return Ok(None);
+        }
+        left_apart(&session()?, name, (&graph, &apart), images)
+    };
+    let first = apart_where_stored(images)?.filter(|(first, _)| config.looks_again(first));
+    let again = match &first {
+        Some((first, again)) => {
+            let second = apart_where_stored(again)?;
+            second.is_none_or(|(second, _)| second.tells_more_than(first)).then_some(again)
+        }
+        None => None,
+    };
     let mut graph = JobGraph::default();
-    add_scene(&mut graph, images, alike, config, seed)?;
-    if is_stored(&graph, store)
-        && let Some(again) = images_of_second_pass(&session()?, name, images, alike, config, seed)?
-    {
-        graph = JobGraph::default();
-        add_scene(&mut graph, &again, alike, config, seed)?;
-    }
+    add_scene(&mut graph, again.map_or(images, Vec::as_slice), alike, config, seed)?;
     Ok(graph)
 }
 

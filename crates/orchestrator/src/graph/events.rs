@@ -61,7 +61,7 @@ pub enum Event {
         /// Why.
         reason: String,
     },
-    /// A job was left out since an input of it failed.
+    /// A job was left out: an input of it has failed or was left out, or it was not to run.
     Skipped {
         /// Its kind.
         kind: &'static str,

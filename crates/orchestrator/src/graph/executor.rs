@@ -10,7 +10,7 @@ use anyhow::{Context, Result};
 
 use super::events::{Event, Observer};
 use super::gathering::{Gathering, Limits};
-use super::job::{Inputs, JobGraph, JobId, Product};
+use super::job::{Inputs, JobGraph, JobId, Product, Use};
 use crate::clock;
 use crate::codec::{self, Artifact};
 use crate::error::Interrupted;
@@ -42,7 +42,7 @@ pub enum State {
     Ran,
     /// It failed, for this reason.
     Failed(String),
-    /// A job whose result it requires failed.
+    /// A job whose result it requires has none, or it was not to run.
     Skipped,
 }
 
@@ -278,12 +278,13 @@ impl<'a> Executor<'a> {
     /// Decides one job and frees those that waited for it.
     fn settle(&self, id: JobId, unkept: &Gathering<Unkept>) {
         let job = self.graph.job(id);
-        let lacking = self.graph.uses(id).any(|(used, edge)| edge.required && self.output(used).is_none());
-        let (state, key, output) = if lacking {
-            self.options.observer.notice(&Event::Skipped { kind: job.kind, job: job.name.clone() });
-            (State::Skipped, None, None)
-        } else {
-            self.decide(id, unkept)
+        let (state, key, output) = match self.is_to_run(id) {
+            Ok(true) => self.decide(id, unkept),
+            Ok(false) => {
+                self.options.observer.notice(&Event::Skipped { kind: job.kind, job: job.name.clone() });
+                (State::Skipped, None, None)
+            }
+            Err(error) => (self.failed(id, &error), None, None),
         };
         let mut shared = self.lock();
         shared.in_flight -= 1;
@@ -307,6 +308,21 @@ impl<'a> Executor<'a> {
                 shared.ready.insert(user);
             }
         }
+    }
+
+    /// Whether a job has what it requires, and all that decide about it let it run.
+    fn is_to_run(&self, id: JobId) -> Result<bool> {
+        if self.graph.uses(id).any(|(used, edge)| edge.is_required() && self.output(used).is_none()) {
+            return Ok(false);
+        }
+        for (gate, edge) in self.graph.uses(id) {
+            if let Use::Gate(opens) = edge
+                && !opens(self, gate)?
+            {
+                return Ok(false);
+            }
+        }
+        Ok(true)
     }
 
     /// Takes the result from the store or runs the job.
@@ -404,8 +420,8 @@ impl<'a> Executor<'a> {
         let job = self.graph.job(id);
         let mut inputs = job.external.clone();
         for (used, edge) in self.graph.uses(id) {
-            if let Some(output) = self.output(used) {
-                inputs.insert(edge.role.clone(), output);
+            if let Some((role, output)) = edge.role().zip(self.output(used)) {
+                inputs.insert(role.to_owned(), output);
             }
         }
         Fingerprint { kind: job.kind.to_owned(), version: job.version, params: job.params.clone(), inputs }
@@ -622,6 +638,26 @@ mod tests {
         assert_eq!(result.failed["test bad"], "no light");
         assert!(result.failed["test worse"].contains("panicked"), "{:?}", result.failed);
         assert_eq!(result.keys.len(), 2);
+    }
+
+    #[test]
+    fn a_job_runs_only_where_another_says_so_and_is_the_same_for_that() {
+        let (_folder, store) = store();
+        let (works, says) = (|| Product::new(Number(7)), || Product::new(Number(3)));
+        let run_where = |most: u32| {
+            let mut graph = JobGraph::default();
+            let gate = graph.add(job("gate", 1, &says));
+            let held = graph.add(job("held", 1, &works));
+            graph.run_only_where(held, gate, move |number: &Number| number.0 <= most);
+            let user = graph.add(job("user", 1, &works));
+            graph.require(user, "a", held);
+            run(&graph, &store, &AtomicBool::new(false)).unwrap()
+        };
+        let closed = run_where(2);
+        assert_eq!((closed.ran, closed.failed.len()), (vec!["test gate".to_owned()], 0));
+        let open = run_where(3);
+        assert_eq!((open.ran, open.hits), (vec!["test held".to_owned(), "test user".to_owned()], 1));
+        assert_eq!(run_where(4).hits, 3);
     }
 
     #[test]

@@ -63,17 +63,39 @@ impl Job<'_> {
 }
 
 /// How a job uses the result of another.
-#[derive(Debug, Clone)]
-pub(super) struct Use {
-    pub role: String,
-    /// Whether the user fails with the used job; otherwise it does without.
-    pub required: bool,
+pub(super) enum Use<'a> {
+    /// As an input.
+    Input {
+        role: String,
+        /// Whether the user fails with the used job; otherwise it does without.
+        required: bool,
+    },
+    /// To know whether it is to run at all.
+    Gate(Opens<'a>),
+}
+
+/// Whether the result of a job lets another run.
+type Opens<'a> = Box<dyn Fn(&Executor<'_>, JobId) -> Result<bool> + Send + Sync + 'a>;
+
+impl Use<'_> {
+    /// The role of an input.
+    pub fn role(&self) -> Option<&str> {
+        match self {
+            Self::Input { role, .. } => Some(role),
+            Self::Gate(_) => None,
+        }
+    }
+
+    /// Whether the user is left out where the used job has no result.
+    pub fn is_required(&self) -> bool {
+        !matches!(self, Self::Input { required: false, .. })
+    }
 }
 
 /// A directed acyclic graph of jobs; edges lead from a job to those that use its result.
 #[derive(Default)]
 pub struct JobGraph<'a> {
-    pub(super) graph: DiGraph<Job<'a>, Use>,
+    pub(super) graph: DiGraph<Job<'a>, Use<'a>>,
     wanted: BTreeSet<JobId>,
     wanted_files: BTreeSet<JobId>,
 }
@@ -96,12 +118,24 @@ impl<'a> JobGraph<'a> {
 
     /// Lets `user` use the result of `used`; without it, `user` is left out.
     pub fn require(&mut self, user: JobId, role: impl Into<String>, used: JobId) {
-        self.graph.add_edge(used, user, Use { role: role.into(), required: true });
+        self.graph.add_edge(used, user, Use::Input { role: role.into(), required: true });
     }
 
     /// Lets `user` use the result of `used` when there is one.
     pub fn accept(&mut self, user: JobId, role: impl Into<String>, used: JobId) {
-        self.graph.add_edge(used, user, Use { role: role.into(), required: false });
+        self.graph.add_edge(used, user, Use::Input { role: role.into(), required: false });
+    }
+
+    /// Leaves `user` out, and all that requires it, unless what `gate` made is such. It is no input of it: what `user` makes does
+    /// not depend on it.
+    pub fn run_only_where<T: Artifact>(
+        &mut self,
+        user: JobId,
+        gate: JobId,
+        opens: impl Fn(&T) -> bool + Send + Sync + 'a,
+    ) {
+        let opens: Opens<'a> = Box::new(move |executor, gate| Ok(opens(&*executor.load::<T>(gate)?)));
+        self.graph.add_edge(gate, user, Use::Gate(opens));
     }
 
     /// A job.
@@ -128,12 +162,13 @@ impl<'a> JobGraph<'a> {
         }
         for edge in self.graph.edge_references() {
             let (from, to) = (edge.source().index(), edge.target().index());
-            let _ = writeln!(dot, "  {from} -> {to} [label={:?}];", edge.weight().role);
+            let _ =
+                writeln!(dot, "  {from} -> {to} [label={:?}];", edge.weight().role().unwrap_or("only where"));
         }
         dot + "}\n"
     }
 
-    pub(super) fn uses(&self, id: JobId) -> impl Iterator<Item = (JobId, &Use)> {
+    pub(super) fn uses(&self, id: JobId) -> impl Iterator<Item = (JobId, &Use<'a>)> {
         self.graph.edges_directed(id, Direction::Incoming).map(|edge| (edge.source(), edge.weight()))
     }
 
@@ -161,7 +196,7 @@ pub struct Inputs<'e, 'a> {
 
 impl<'e, 'a> Inputs<'e, 'a> {
     pub(super) fn new(executor: &'e Executor<'a>, id: JobId) -> Self {
-        let used = executor.graph.uses(id).map(|(used, edge)| (edge.role.as_str(), used)).collect();
+        let used = executor.graph.uses(id).filter_map(|(used, edge)| Some((edge.role()?, used))).collect();
         Self { executor, id, used }
     }
 

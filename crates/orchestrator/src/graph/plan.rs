@@ -46,9 +46,10 @@ impl JobGraph<'_> {
             let mut inputs = job.external.clone();
             let mut waits_for = Vec::new();
             for (used, edge) in self.uses(id) {
-                match outputs.get(&used) {
-                    Some(output) => drop(inputs.insert(edge.role.clone(), *output)),
-                    None => waits_for.push(format!("uses {}", self.job(used).label())),
+                match (outputs.get(&used), edge.role()) {
+                    (Some(output), Some(role)) => drop(inputs.insert(role.to_owned(), *output)),
+                    (Some(_), None) => {}
+                    (None, _) => waits_for.push(format!("uses {}", self.job(used).label())),
                 }
             }
             let fingerprint = Fingerprint {

@@ -37,6 +37,8 @@ pub enum ModelKind {
 pub struct ModelJobs {
     /// One job an image.
     pub features: Vec<JobId>,
+    /// The job whose result the model is before it is aligned.
+    pub mapped: JobId,
     /// The job whose result the model is.
     pub model: JobId,
     /// The positions that place it and that it is adjusted to.
@@ -102,7 +104,7 @@ pub fn add_model(
         let input = ModelInput { cameras: &cameras, measured: &of_model, pairs: &pair_list };
         run_model(inputs, &stage, &input, seed)
     };
-    let model = graph.add(Job {
+    let mapped = graph.add(Job {
         kind: if kind == ModelKind::Scene { "model" } else { "local_model" },
         version: stages::MAPPER_VERSION,
         name: name.to_owned(),
@@ -112,19 +114,19 @@ pub fn add_model(
         work: Box::new(work),
     });
     for (at, used) in features.iter().enumerate() {
-        graph.accept(model, features_role(at), *used);
+        graph.accept(mapped, features_role(at), *used);
     }
     for (a, b, used) in pairs {
-        graph.accept(model, pair_role(a, b), used.verified);
-        graph.accept(model, matches_role(a, b), used.matches);
+        graph.accept(mapped, pair_role(a, b), used.verified);
+        graph.accept(mapped, matches_role(a, b), used.matches);
     }
     let model = if config.alignment.enabled {
         let known = KnownOfModel { cameras: fixed, measured: measured.clone() };
-        add_alignment(graph, images, (&features, model), known, &config.alignment)
+        add_alignment(graph, images, (&features, mapped), known, &config.alignment)
     } else {
-        model
+        mapped
     };
-    Ok(ModelJobs { features, model, measured })
+    Ok(ModelJobs { features, mapped, model, measured })
 }
 
 fn pair_role(a: usize, b: usize) -> String {

@@ -31,15 +31,35 @@ pub struct SceneJobs {
     pub features: Vec<JobId>,
     /// The job whose result the model is.
     pub model: JobId,
-    /// Which images the model leaves out of its largest component.
-    pub left_apart: JobId,
+    /// What the model leaves apart.
+    pub apart: ApartJob,
     /// The scene file.
     pub scene: JobId,
+    /// The first job after the model is mapped.
+    finishing: JobId,
+}
+
+impl SceneJobs {
+    /// Leaves the model as it is mapped, without alignment and scene, unless what it leaves apart is such.
+    pub fn finish_only_where<'a>(
+        &self,
+        graph: &mut JobGraph<'a>,
+        stays: impl Fn(&LeftApart) -> bool + Send + Sync + 'a,
+    ) {
+        graph.run_only_where(self.finishing, self.apart.job, stays);
+    }
+}
+
+/// The job that says which images a model leaves out of its largest component.
+#[derive(Debug, Clone)]
+pub struct ApartJob {
+    /// The job.
+    pub job: JobId,
     /// The model's images, in its order, as places in the list of the images given.
     order: Vec<usize>,
 }
 
-impl SceneJobs {
+impl ApartJob {
     /// The images given, those to be looked at once more that the model leaves apart.
     pub fn looked_at_again(&self, images: &[SourceImage], left: &LeftApart) -> Vec<SourceImage> {
         let mut images = images.to_vec();
@@ -116,8 +136,26 @@ pub fn add_first_model(
     Ok(SceneModelJobs { model: jobs.model, order })
 }
 
-/// Adds the job that says which images a model leaves apart.
-fn add_left_apart(graph: &mut JobGraph<'_>, model: JobId, num_images: usize) -> JobId {
+/// Adds all jobs from image files to what the model of a scene leaves apart.
+///
+/// # Errors
+/// When parameters have no JSON form.
+pub fn add_model_apart(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    alike: &[(usize, usize)],
+    config: &Config,
+    seed: u64,
+) -> Result<ApartJob> {
+    let mut config = config.clone();
+    config.alignment.enabled = false;
+    let OrderedModel { jobs, order, .. } = add_ordered_model(graph, images, alike, &config, seed)?;
+    Ok(add_left_apart(graph, jobs.mapped, order))
+}
+
+/// Adds the job that says which images a model leaves apart: before it is aligned, which joins no parts.
+fn add_left_apart(graph: &mut JobGraph<'_>, model: JobId, order: Vec<usize>) -> ApartJob {
+    let num_images = order.len();
     let work = move |inputs: &Inputs<'_, '_>| {
         let model = inputs.get::<MapperOutput>("model")?;
         Product::new(left_apart(&model, num_images))
@@ -132,7 +170,7 @@ fn add_left_apart(graph: &mut JobGraph<'_>, model: JobId, num_images: usize) -> 
         work: Box::new(work),
     });
     graph.require(left_apart, "model", model);
-    left_apart
+    ApartJob { job: left_apart, order }
 }
 
 /// What a model of so many images leaves apart; of a model without components that is everything.
@@ -162,7 +200,7 @@ pub fn add_scene(
 ) -> Result<SceneJobs> {
     let OrderedModel { jobs, images, order, origin } = add_ordered_model(graph, images, alike, config, seed)?;
     let measured = jobs.measured;
-    let left_apart = add_left_apart(graph, jobs.model, images.len());
+    let apart = add_left_apart(graph, jobs.mapped, order.clone());
     let index_params = config.index.clone();
     let index_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
@@ -305,7 +343,8 @@ pub fn add_scene(
     for (&at, &job) in order.iter().zip(&jobs.features) {
         features[at] = job;
     }
-    Ok(SceneJobs { features, model: jobs.model, left_apart, scene, order })
+    let finishing = if jobs.model == jobs.mapped { index } else { jobs.model };
+    Ok(SceneJobs { features, model: jobs.model, apart, scene, finishing })
 }
 
 /// Which component a note is of, unless it is the largest.

@@ -361,11 +361,11 @@ impl<'a> Model<'a> {
         !self.input.is_fixed(camera) || self.cameras[camera].model != self.input.cameras[camera].model
     }
 
-    /// Recomputes the rays of every image that uses `camera` after its intrinsics have changed.
+    /// Recomputes the rays of every image that uses `camera` after its intrinsics have changed; images without any get none.
     pub fn refresh_rays(&mut self, camera: usize) {
         let camera_now = &self.cameras[camera];
         self.rays.par_iter_mut().with_max_len(1).zip(&self.input.images).for_each(|(rays, image)| {
-            if image.camera.index() == camera {
+            if image.camera.index() == camera && !rays.bearings.is_empty() {
                 *rays = image.features.rays(camera_now);
             }
         });
