@@ -104,8 +104,11 @@ fn a_torn_scene_is_looked_at_once_more() {
     let registered = |built: &Built| built.scene.main().map_or(0, |model| model.registered().count());
     assert!(registered(&once) < 3, "the scene must be torn for this test to say anything");
     let config = Config { features: few, ..Config::default() };
+    let store = folder.path().join("another store");
     let twice = build(&store, &panoramas, &config);
     assert!(registered(&twice) >= 3, "{}", registered(&twice));
+    // The model that does not stay is not finished.
+    assert_eq!((ran(&twice, "model").len(), ran(&twice, "aligned").len()), (2, 1), "{:?}", twice.run.ran);
     assert!(build(&store, &panoramas, &config).run.ran.is_empty());
 }
 
