@@ -189,7 +189,7 @@ pub fn align_tracks<E: Send>(
         prior.hold_stretch(&tracks.component.cameras[prior.camera as usize], STITCHING_OF_EACH);
     }
     // A loss that bends so early keeps what lies beyond it where it began, each point in a valley of its own: first what is far
-    // off comes near (A. Blake, A. Zisserman, "Visual Reconstruction", 1987: graduated non-convexity). The cost ends 3–11 % lower, the
+    // off comes near (A. Blake, A. Zisserman, "Visual Reconstruction", 1987: graduated non-convexity). The cost ends 2–15 % lower, the
     // same from wherever it begins, and centres of 20 rendered scenes are 2 % nearer to the truth.
     let wide = RobustLoss::Cauchy(WIDE_LOSS * params.loss_sigma);
     let wide = BundleParams { loss: wide, function_tolerance: FIRST_TOLERANCE, ..bundle };

@@ -54,16 +54,20 @@ impl Console {
         stage.done += 1;
         stage.hits += usize::from(hit);
         if let Some(bar) = &stage.bar {
-            bar.set_message(if stage.hits > 0 {
-                format!("({} from cache)", stage.hits)
-            } else {
-                String::new()
-            });
             bar.inc(1);
-        } else if stage.done == stage.total {
-            let cached = if stage.hits > 0 { format!(" ({} from cache)", stage.hits) } else { String::new() };
-            print::note(&format!("{kind}: {}/{}{cached}", stage.done, stage.total));
         }
+        stage.show(kind);
+    }
+
+    /// One job of a kind less is to be done.
+    fn leave_out(&self, kind: &str) {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(stage) = state.stages.get_mut(kind) else { return };
+        stage.total -= 1;
+        if let Some(bar) = &stage.bar {
+            bar.set_length(stage.total as u64);
+        }
+        stage.show(kind);
     }
 
     fn tell(&self, text: &str) {
@@ -71,6 +75,18 @@ impl Console {
         match &state.bars {
             Some(bars) => bars.suspend(|| print::note(text)),
             None => print::note(text),
+        }
+    }
+}
+
+impl Stage {
+    /// On a terminal how many were stored, elsewhere a line once all are done.
+    fn show(&self, kind: &str) {
+        let cached = if self.hits > 0 { format!("({} from cache)", self.hits) } else { String::new() };
+        if let Some(bar) = &self.bar {
+            bar.set_message(cached);
+        } else if self.done == self.total && self.total > 0 {
+            print::note(format!("{kind}: {}/{} {cached}", self.done, self.total).trim_end());
         }
     }
 }
@@ -102,9 +118,8 @@ impl Observer for Console {
                 *self.state.lock().unwrap_or_else(PoisonError::into_inner) = State { bars, stages };
             }
             Event::Hit { kind, .. } => self.step(kind, true),
-            Event::Finished { kind, .. } | Event::Unkept { kind, .. } | Event::Skipped { kind, .. } => {
-                self.step(kind, false);
-            }
+            Event::Finished { kind, .. } | Event::Unkept { kind, .. } => self.step(kind, false),
+            Event::Skipped { kind, .. } => self.leave_out(kind),
             Event::Failed { kind, job, reason } => {
                 self.tell(&format!("warning: {kind} {job}: {reason}"));
                 self.step(kind, false);
