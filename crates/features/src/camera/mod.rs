@@ -337,7 +337,7 @@ impl Camera {
             return equirectangular::pixel_angle(&self.params, pixel);
         }
         if self.is_stretched() {
-            return stitched::ray(&self.params, pixel).map(|(_, d_pixel)| pixel_angle(&d_pixel));
+            return self.ray(pixel).map(|(_, angle)| angle);
         }
         self.unproject_with_jacobian(pixel).map(|ray| ray.pixel_angle())
     }

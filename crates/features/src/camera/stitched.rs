@@ -62,6 +62,12 @@ impl Field {
         self.stretch + plain.cross_matrix() * self.twist - (self.twist * plain).cross_matrix()
     }
 
+    /// That derivative along one direction, which costs less than the whole where few are asked for.
+    #[inline(always)]
+    fn along(&self, plain: &Vector3<f64>, by: &Vector3<f64>) -> Vector3<f64> {
+        self.stretch * by + by.cross(&(self.twist * plain)) + plain.cross(&(self.twist * by))
+    }
+
     /// Its derivatives by the parameters, in their order.
     #[inline(always)]
     fn by_params(plain: &Vector3<f64>) -> [Vector3<f64>; STRETCHES + TWISTS] {
@@ -142,16 +148,11 @@ pub(super) fn ray(params: &[f64], pixel: &Vector2<f64>) -> Option<(Vector3<f64>,
 #[inline(always)]
 pub(super) fn ray_of_plain(params: &[f64], plain: &PlainRay) -> (Vector3<f64>, Matrix3x2<f64>) {
     let field = Field::of(params);
-    let twisted = field.twist * plain.bearing;
-    let ray = field.stretch * plain.bearing + plain.bearing.cross(&twisted);
+    let ray = field.of_plain(&plain.bearing);
     let length = ray.norm();
     let bearing = ray / length;
-    // Two directions cost less than the whole derivative.
     let d_pixel = [0, 1].map(|at: usize| {
-        let by_pixel: Vector3<f64> = plain.d_pixel.column(at).into_owned();
-        let moved = field.stretch * by_pixel
-            + by_pixel.cross(&twisted)
-            + plain.bearing.cross(&(field.twist * by_pixel));
+        let moved = field.along(&plain.bearing, &plain.d_pixel.column(at).into_owned());
         (moved - bearing * bearing.dot(&moved)) / length
     });
     (bearing, Matrix3x2::from_columns(&d_pixel))

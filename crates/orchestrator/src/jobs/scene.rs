@@ -128,12 +128,24 @@ pub fn add_first_model(
     config: &Config,
     seed: u64,
 ) -> Result<SceneModelJobs> {
-    let mut config = config.clone();
     // Cameras need no better points than those of the keypoints.
+    let model = add_mapped_model(graph, images, alike, config, seed)?;
+    graph.want(model.model);
+    Ok(model)
+}
+
+/// Adds all jobs from image files to a model that is not aligned.
+fn add_mapped_model(
+    graph: &mut JobGraph<'_>,
+    images: &[SourceImage],
+    alike: &[(usize, usize)],
+    config: &Config,
+    seed: u64,
+) -> Result<SceneModelJobs> {
+    let mut config = config.clone();
     config.alignment.enabled = false;
     let OrderedModel { jobs, order, .. } = add_ordered_model(graph, images, alike, &config, seed)?;
-    graph.want(jobs.model);
-    Ok(SceneModelJobs { model: jobs.model, order })
+    Ok(SceneModelJobs { model: jobs.mapped, order })
 }
 
 /// Adds all jobs from image files to what the model of a scene leaves apart.
@@ -147,10 +159,8 @@ pub fn add_model_apart(
     config: &Config,
     seed: u64,
 ) -> Result<ApartJob> {
-    let mut config = config.clone();
-    config.alignment.enabled = false;
-    let OrderedModel { jobs, order, .. } = add_ordered_model(graph, images, alike, &config, seed)?;
-    Ok(add_left_apart(graph, jobs.mapped, order))
+    let SceneModelJobs { model, order } = add_mapped_model(graph, images, alike, config, seed)?;
+    Ok(add_left_apart(graph, model, order))
 }
 
 /// Adds the job that says which images a model leaves apart: before it is aligned, which joins no parts.
@@ -200,7 +210,7 @@ pub fn add_scene(
 ) -> Result<SceneJobs> {
     let OrderedModel { jobs, images, order, origin } = add_ordered_model(graph, images, alike, config, seed)?;
     let measured = jobs.measured;
-    let apart = add_left_apart(graph, jobs.mapped, order.clone());
+    let apart = add_left_apart(graph, jobs.mapped, order);
     let index_params = config.index.clone();
     let index_work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
@@ -340,7 +350,7 @@ pub fn add_scene(
         graph.accept(scene, features_role(at), *features);
     }
     let mut features = jobs.features.clone();
-    for (&at, &job) in order.iter().zip(&jobs.features) {
+    for (&at, &job) in apart.order.iter().zip(&jobs.features) {
         features[at] = job;
     }
     let finishing = if jobs.model == jobs.mapped { index } else { jobs.model };
