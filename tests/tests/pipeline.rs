@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, OnceLock};
 
 use setloc_camset::{PhotoLocalization, Verdict};
 use setloc_features::Calibration;
@@ -70,11 +70,22 @@ fn assert_main_job(figures: &DatasetFigures) {
     }
 }
 
+/// The sample town, rendered once for all tests, which only read it.
+fn sample() -> &'static Path {
+    static SAMPLE: OnceLock<PathBuf> = OnceLock::new();
+    SAMPLE.get_or_init(|| {
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("sample");
+        if folder.exists() {
+            std::fs::remove_dir_all(&folder).unwrap();
+        }
+        stages::write_sample(&folder).unwrap();
+        folder
+    })
+}
+
 #[test]
 fn the_town_is_mapped_and_its_set_located() {
-    let folder = tempfile::tempdir().unwrap();
-    stages::write_sample(folder.path()).unwrap();
-    let figures = bench(folder.path());
+    let figures = bench(sample());
     assert!(!figures.sets.is_empty());
     assert_main_job(&figures);
 }
@@ -82,7 +93,7 @@ fn the_town_is_mapped_and_its_set_located() {
 #[test]
 fn a_set_without_truth_is_compared_with_a_reconstruction_of_scene_and_photos_together() {
     let folder = tempfile::tempdir().unwrap();
-    stages::write_sample(folder.path()).unwrap();
+    copy_files(sample(), folder.path());
     std::fs::remove_file(folder.path().join("truth.json")).unwrap();
     let config = Config::default();
     let options = BenchOptions { config, seed: 0, gps: BenchGps::None, joint_reference: true };
@@ -100,18 +111,17 @@ fn a_set_without_truth_is_compared_with_a_reconstruction_of_scene_and_photos_tog
 
 #[test]
 fn a_set_of_unknown_intrinsics_is_located_and_tells_them() {
-    let folder = tempfile::tempdir().unwrap();
-    stages::write_sample(folder.path()).unwrap();
-    let session = session(&folder.path().join("store"));
+    let (folder, store) = (sample(), tempfile::tempdir().unwrap());
+    let session = session(store.path());
     let read = |part: &str, cameras: &CameraBook| {
-        let files = list_images(&[folder.path().join(part)]).unwrap();
+        let files = list_images(&[folder.join(part)]).unwrap();
         ImageFolder::read(&files, cameras, &GeoSource::None, None).unwrap()
     };
     let config = Config::default();
     let panoramas = read("panoramas", &CameraBook::default());
     let built = built(&session, &panoramas, &config);
     let what = LocateJobs { scene: Arc::clone(&built.scene), pictures: Arc::default(), config, seed: 0 };
-    let known = CameraBook::read(&folder.path().join("cameras.json")).unwrap();
+    let known = CameraBook::read(&folder.join("cameras.json")).unwrap();
     let mut by_cameras = [read("queries/lane", &known), read("queries/lane", &CameraBook::default())];
     let truth = by_cameras[0].images[0].camera.clone();
     let guess = by_cameras[1].images[0].camera.clone();
@@ -137,12 +147,11 @@ fn a_set_of_unknown_intrinsics_is_located_and_tells_them() {
 
 #[test]
 fn photos_localized_earlier_localize_one_that_the_panoramas_do_not() {
-    let folder = tempfile::tempdir().unwrap();
-    stages::write_sample(folder.path()).unwrap();
-    let session = session(&folder.path().join("store"));
-    let cameras = CameraBook::read(&folder.path().join("cameras.json")).unwrap();
+    let (folder, store) = (sample(), tempfile::tempdir().unwrap());
+    let session = session(store.path());
+    let cameras = CameraBook::read(&folder.join("cameras.json")).unwrap();
     let read = |part: &str| {
-        let files = list_images(&[folder.path().join(part)]).unwrap();
+        let files = list_images(&[folder.join(part)]).unwrap();
         ImageFolder::read(&files, &cameras, &GeoSource::None, None).unwrap()
     };
     let config = Config::default();
@@ -212,7 +221,7 @@ fn a_real_set_of_which_one_standpoint_sees_the_scene_gets_its_scale_from_a_facad
     let Some(dataset) = shared("lzr") else { return };
     let folder = tempfile::tempdir().unwrap();
     for images in ["panoramas", "queries"] {
-        copy_images(&dataset.join(images), &folder.path().join(images));
+        copy_files(&dataset.join(images), &folder.path().join(images));
     }
     let cameras = std::fs::read_to_string(dataset.join("cameras.json")).unwrap();
     let mut cameras: serde_json::Value = serde_json::from_str(&cameras).unwrap();
@@ -259,12 +268,12 @@ fn real_photos_turned_on_one_spot_tell_their_focal_length() {
     }
 }
 
-fn copy_images(from: &Path, to: &Path) {
+fn copy_files(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).unwrap();
     for entry in std::fs::read_dir(from).unwrap().map(Result::unwrap) {
         let to = to.join(entry.file_name());
         if entry.file_type().unwrap().is_dir() {
-            copy_images(&entry.path(), &to);
+            copy_files(&entry.path(), &to);
         } else {
             std::fs::copy(entry.path(), &to).unwrap();
         }

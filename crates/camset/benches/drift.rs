@@ -56,7 +56,7 @@ fn main() {
                 .iter()
                 .map(|photo| locate_single(&SingleParams::default(), &scene, photo, seed))
                 .collect();
-            let alone: Vec<&SingleLocalization> = alone.iter().collect();
+            let alone: Vec<_> = alone.iter().map(SingleLocalization::evidence).collect();
             let models = std::slice::from_ref(&world.local);
             let no_views = || Ok::<_, Infallible>(Views::default());
             let Ok(found) =

@@ -1,25 +1,37 @@
 //! One photo in all components of a scene, and which component's answer stands.
 
+use setloc_features::ImageFeatures;
+
 use crate::jackknife::deviation;
+use crate::single::locate_with_nearest;
 use crate::{
-    AnywhereLocalization, PhotoLocalization, QueryPhoto, Scene, SingleParams, Verdict, VerdictParams,
-    locate_single,
+    AnywhereLocalization, NearestAnywhere, PhotoLocalization, QueryPhoto, Scene, SingleParams, Verdict,
+    VerdictParams,
 };
 
 /// Bound on the squared deviation of two poses in what both covariances state: χ² of six degrees of freedom at 99.9 %.
 const SAME_PLACE: f64 = 22.5;
 
+/// The scene points nearest to each feature of a photo in each component.
+pub fn nearest_anywhere(components: &[Scene<'_>], features: &ImageFeatures) -> NearestAnywhere {
+    let nearest = |scene: &Scene<'_>| scene.index.nearest_points(&features.descriptors);
+    NearestAnywhere { components: components.iter().map(nearest).collect() }
+}
+
 /// Localizes one photo alone in each component, and takes the answer of the one that says most.
 ///
-/// `components` has at least one, the largest first. Where another component supports another place nearly as well, the
+/// `components` has at least one, the largest first, and `nearest` is what [`nearest_anywhere`] finds in them. Where another component supports another place nearly as well, the
 /// answer is *uncertain*, as it is where two places of one component do.
 pub fn locate_single_anywhere(
     params: &SingleParams,
     components: &[Scene<'_>],
     photo: &QueryPhoto<'_>,
+    nearest: &NearestAnywhere,
     seed: u64,
 ) -> AnywhereLocalization {
-    let found: Vec<_> = components.iter().map(|scene| locate_single(params, scene, photo, seed)).collect();
+    let found: Vec<_> = (components.iter().zip(&nearest.components))
+        .map(|(scene, nearest)| locate_with_nearest(params, scene, photo, nearest, seed))
+        .collect();
     let seen: Vec<_> = found.iter().map(|found| [(0, found.photo.inliers)]).collect();
     let candidates: Vec<Candidate<'_>> = (found.iter().zip(components).zip(&seen))
         .map(|((found, scene), seen)| Candidate { answer: &found.photo, is_placed: scene.is_placed, seen })
@@ -115,10 +127,12 @@ pub(crate) fn is_rival(params: &VerdictParams, rival: usize, support: usize) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::locate_single;
     use crate::synthetic::{Place, World};
 
     fn locate(components: &[Scene<'_>], photo: &QueryPhoto<'_>) -> PhotoLocalization {
-        locate_single_anywhere(&SingleParams::default(), components, photo, 3).photo
+        let nearest = nearest_anywhere(components, photo.features);
+        locate_single_anywhere(&SingleParams::default(), components, photo, &nearest, 3).photo
     }
 
     #[test]

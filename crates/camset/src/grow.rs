@@ -23,7 +23,7 @@ use crate::common::{PoseError, shift_by};
 use crate::evidence::{PhotoRays, median};
 use crate::guided::guided_matches;
 use crate::single::{inliers, union};
-use crate::{CamsetParams, PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, Verdict};
+use crate::{CamsetParams, PhotoEvidence, PhotoLocalization, QueryPhoto, Scene, SceneMatch, Verdict};
 
 /// Which points of photos the scene grows by.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -93,7 +93,7 @@ pub fn grow(
     params: &GrowthParams,
     camset: &CamsetParams,
     scene: &Scene<'_>,
-    (photos, alone): (&[QueryPhoto<'_>], &[&SingleLocalization]),
+    (photos, alone): (&[QueryPhoto<'_>], &[PhotoEvidence<'_>]),
     answers: &[Option<&PhotoLocalization>],
     local_models: &[Reconstruction],
 ) -> Growth {
@@ -105,10 +105,10 @@ pub fn grow(
         .collect();
     let grower = Grower { params, max_error_sigmas: camset.max_error_sigmas, scene, alone, placed: &placed };
     let guided = |photo: &Placed<'_>| {
-        let nearest = &alone[photo.photo].nearest;
+        let nearest = alone[photo.photo].nearest;
         let found = guided_matches(&camset.guided, scene.index, &photo.rays, nearest, &photo.pose);
         // What it sees alone has been tested by more than its resemblance.
-        let found = union(&alone[photo.photo].inliers, &found);
+        let found = union(alone[photo.photo].inliers, &found);
         inliers(&photo.rays, scene.index, &photo.pose, &found, camset.max_error_sigmas)
     };
     let mut seen: Vec<Vec<SceneMatch>> = placed.par_iter().with_max_len(1).map(guided).collect();
@@ -164,7 +164,7 @@ struct Grower<'a> {
     params: &'a GrowthParams,
     max_error_sigmas: f64,
     scene: &'a Scene<'a>,
-    alone: &'a [&'a SingleLocalization],
+    alone: &'a [PhotoEvidence<'a>],
     placed: &'a [Placed<'a>],
 }
 
@@ -300,13 +300,16 @@ mod tests {
     use super::*;
     use crate::jackknife::deviation;
     use crate::synthetic::World;
-    use crate::{SetLocalization, SingleParams, ViewParams, Views, locate_set, locate_single, match_views};
+    use crate::{
+        SetLocalization, SingleLocalization, SingleParams, ViewParams, Views, locate_set, locate_single,
+        match_views,
+    };
 
     /// The photos of a world as a set, and each alone.
     fn located(world: &World) -> (SetLocalization, Vec<SingleLocalization>) {
         let alone = |photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7);
         let alone: Vec<SingleLocalization> = world.queries().iter().map(alone).collect();
-        let borrowed: Vec<&SingleLocalization> = alone.iter().collect();
+        let borrowed: Vec<PhotoEvidence<'_>> = alone.iter().map(SingleLocalization::evidence).collect();
         let (params, models) = (CamsetParams::default(), std::slice::from_ref(&world.local));
         let views = || Ok::<_, Infallible>(Views::default());
         let Ok(set) =
@@ -317,7 +320,7 @@ mod tests {
     /// What the first photos of a world add to its scene.
     fn growth_of(world: &World, photos: usize) -> Growth {
         let (set, alone) = located(world);
-        let alone: Vec<&SingleLocalization> = alone.iter().collect();
+        let alone: Vec<PhotoEvidence<'_>> = alone.iter().map(SingleLocalization::evidence).collect();
         let answers: Vec<Option<&PhotoLocalization>> =
             set.refined.iter().enumerate().map(|(at, photo)| (at < photos).then_some(photo)).collect();
         let (queries, models) = (world.queries(), std::slice::from_ref(&world.local));

@@ -37,15 +37,15 @@ mod verdict;
 mod views;
 
 pub use advice::{Link, PathToScene};
-pub use anywhere::locate_single_anywhere;
+pub use anywhere::{locate_single_anywhere, nearest_anywhere};
 pub use grow::{GrownScene, Growth, GrowthParams, GrowthPhoto, GrowthPoint, grow};
 pub use params::{CamsetMethod, CamsetParams, GuidedParams, SingleParams, VerdictParams};
 pub use pictures::{Picture, Pictures};
 pub use set::{locate_set, locate_set_anywhere};
 pub use single::locate_single;
 pub use types::{
-    AnywhereLocalization, GrownImage, LocalModels, PhotoLocalization, PlacedModel, QueryPhoto, Scene,
-    SceneMatch, SetLocalization, SingleLocalization, Verdict,
+    AnywhereLocalization, GrownImage, LocalModels, NearestAnywhere, PhotoEvidence, PhotoLocalization,
+    PlacedModel, QueryPhoto, Scene, SceneMatch, SetLocalization, SingleAnswer, SingleLocalization, Verdict,
 };
 pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match_views};
 

@@ -15,8 +15,8 @@ use setloc_sfm::{
 
 use crate::advice::{Link, name_open_pairs, widest_paths};
 use crate::{
-    CamsetParams, LocalModels, PhotoLocalization, PlacedModel, QueryPhoto, Scene, SetLocalization,
-    SingleLocalization, Verdict, Views, verdict::standard_deviations,
+    CamsetParams, LocalModels, PhotoEvidence, PhotoLocalization, PlacedModel, QueryPhoto, Scene,
+    SetLocalization, Verdict, Views, verdict::standard_deviations,
 };
 
 use joint::{Component, ComponentAnswer, ComponentPoses};
@@ -39,7 +39,7 @@ pub fn locate_set<E>(
     params: &CamsetParams,
     scene: &Scene<'_>,
     photos: &[QueryPhoto<'_>],
-    alone: &[&SingleLocalization],
+    alone: &[PhotoEvidence<'_>],
     local_models: LocalModels<'_>,
     views: impl FnOnce() -> Result<Views, E>,
     seed: u64,
@@ -51,7 +51,7 @@ fn answer<E>(
     params: &CamsetParams,
     scene: &Scene<'_>,
     photos: &[QueryPhoto<'_>],
-    alone: &[&SingleLocalization],
+    alone: &[PhotoEvidence<'_>],
     local_models: LocalModels<'_>,
     views: impl FnOnce() -> Result<Views, E>,
     seed: u64,
@@ -155,7 +155,7 @@ const MAX_APART: f64 = 6.0;
 fn locate_by(
     params: &CamsetParams,
     scene: &Scene<'_>,
-    (photos, evidence): (&[QueryPhoto<'_>], &[&SingleLocalization]),
+    (photos, evidence): (&[QueryPhoto<'_>], &[PhotoEvidence<'_>]),
     local_models: LocalModels<'_>,
     views: &Views,
     seed: u64,
@@ -240,7 +240,7 @@ fn locate_by(
 }
 
 /// Whether each photo of a local model is localized alone, at the place that the model gives it.
-fn agree_alone(evidence: &[&SingleLocalization], members: &[usize], found: &ComponentPoses) -> Vec<bool> {
+fn agree_alone(evidence: &[PhotoEvidence<'_>], members: &[usize], found: &ComponentPoses) -> Vec<bool> {
     let is_alone = |photo: &usize| evidence[*photo].photo.verdict == Verdict::Localized;
     members.iter().zip(&found.elsewhere).map(|(photo, elsewhere)| is_alone(photo) && !elsewhere).collect()
 }
@@ -252,7 +252,7 @@ fn agree_alone(evidence: &[&SingleLocalization], members: &[usize], found: &Comp
 fn doubt_beyond(
     pair: &OutvotedPair,
     photos: &[QueryPhoto<'_>],
-    evidence: &[&SingleLocalization],
+    evidence: &[PhotoEvidence<'_>],
     members: &[usize],
     found: &mut ComponentPoses,
 ) {
@@ -283,7 +283,7 @@ fn doubt_beyond(
 fn doubt_folded(
     doubtful: &[ImageId],
     enough: usize,
-    evidence: &[&SingleLocalization],
+    evidence: &[PhotoEvidence<'_>],
     members: &[usize],
     found: &mut ComponentPoses,
 ) {
@@ -311,7 +311,7 @@ fn called(names: &[&str], component: usize) -> String {
 /// Models of one photo, of those that no local model has and that are not localized alone.
 fn left_alone(
     photos: &[QueryPhoto<'_>],
-    evidence: &[&SingleLocalization],
+    evidence: &[PhotoEvidence<'_>],
     local_models: &[Reconstruction],
 ) -> Vec<Reconstruction> {
     let in_model = |photo: usize| {
@@ -378,9 +378,9 @@ fn keep_better(kept: &mut Option<PhotoLocalization>, other: PhotoLocalization) -
 /// Answers of the set, and where it has none, those of the photos alone.
 fn or_alone(
     answers: Vec<Option<PhotoLocalization>>,
-    evidence: &[&SingleLocalization],
+    evidence: &[PhotoEvidence<'_>],
 ) -> Vec<PhotoLocalization> {
-    let alone = |evidence: &SingleLocalization| {
+    let alone = |evidence: &PhotoEvidence<'_>| {
         let mut alone = evidence.photo.clone();
         let origin = match alone.verdict {
             Verdict::NotLocalized => "neither its local model nor the photo alone is localized",
@@ -406,7 +406,7 @@ mod tests {
     use super::*;
     use crate::jackknife::deviation;
     use crate::synthetic::{Place, World, along_street};
-    use crate::{CamsetMethod, PathToScene, SingleParams, locate_single};
+    use crate::{CamsetMethod, PathToScene, SingleLocalization, SingleParams, locate_single};
 
     fn locate_photos(
         params: &CamsetParams,
@@ -428,7 +428,7 @@ mod tests {
         views: impl FnOnce() -> Views,
         seed: u64,
     ) -> SetLocalization {
-        let alone: Vec<&SingleLocalization> = alone.iter().collect();
+        let alone: Vec<PhotoEvidence<'_>> = alone.iter().map(SingleLocalization::evidence).collect();
         let Ok(found) = locate_set(
             params,
             scene,
@@ -592,7 +592,7 @@ mod tests {
             let alone: Vec<_> = (world.queries().iter())
                 .map(|query| locate_single(&SingleParams::default(), &scene, query, 3))
                 .collect();
-            let references: Vec<&SingleLocalization> = alone.iter().collect();
+            let references: Vec<PhotoEvidence<'_>> = alone.iter().map(SingleLocalization::evidence).collect();
             let (queries, models) = (world.queries(), std::slice::from_ref(&world.local).into());
             let no_views = || Ok::<_, Infallible>(Views::default());
             let params = CamsetParams::default();
@@ -732,7 +732,7 @@ mod tests {
         };
         let locate = |world: &World| {
             let alone = photos(world);
-            let alone: Vec<&SingleLocalization> = alone.iter().collect();
+            let alone: Vec<PhotoEvidence<'_>> = alone.iter().map(SingleLocalization::evidence).collect();
             let models = std::slice::from_ref(&world.local);
             let (params, queries) = (CamsetParams::default(), world.queries());
             locate_set(&params, &world.scene(), &queries, &alone, models.into(), || Err("damaged"), 7)
@@ -854,7 +854,7 @@ mod tests {
             .iter()
             .map(|photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7))
             .collect();
-        let evidence: Vec<&SingleLocalization> = alone.iter().collect();
+        let evidence: Vec<PhotoEvidence<'_>> = alone.iter().map(SingleLocalization::evidence).collect();
         let locate_with = |matches: usize, side: Vec<ImageId>| {
             let (first, second) = (ImageId(5), ImageId(6));
             let outvoted = [vec![OutvotedPair { first, second, matches, held_by: 60, side }]];

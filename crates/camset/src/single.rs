@@ -13,7 +13,9 @@ use crate::stretch::PhotoStretch;
 use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_precision, judge_support, weaker};
-use crate::{PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleLocalization, SingleParams, Verdict};
+use crate::{
+    PhotoLocalization, QueryPhoto, Scene, SceneMatch, SingleAnswer, SingleLocalization, SingleParams, Verdict,
+};
 
 /// Points in a minimal sample of P3P.
 const SAMPLE: usize = 3;
@@ -48,18 +50,19 @@ pub fn locate_single(
     seed: u64,
 ) -> SingleLocalization {
     let nearest = scene.index.nearest_points(&photo.features.descriptors);
-    let (photo, inliers) = locate_with_nearest(params, scene, photo, &nearest, seed);
+    let SingleAnswer { photo, inliers } = locate_with_nearest(params, scene, photo, &nearest, seed);
     SingleLocalization { photo, inliers, nearest }
 }
 
-/// The answer and the matches that agree, where the nearest scene points of all features are known.
-fn locate_with_nearest(
+/// [`locate_single`] where the nearest scene points of all features are known.
+pub(crate) fn locate_with_nearest(
     params: &SingleParams,
     scene: &Scene<'_>,
     photo: &QueryPhoto<'_>,
     nearest: &[NearestPoints],
     seed: u64,
-) -> (PhotoLocalization, Vec<SceneMatch>) {
+) -> SingleAnswer {
+    let refused = |photo| SingleAnswer { photo, inliers: Vec::new() };
     // Simulated views tie photos to each other, and help once a pose is known. Before, they add less to a scene of which
     // each point was seen from several sides than the chance matches of so many more features take away.
     let matches: Vec<SceneMatch> = scene
@@ -74,19 +77,19 @@ fn locate_with_nearest(
             matches.len(),
             params.verdict.min_inliers
         );
-        return (PhotoLocalization::not_localized(photo, scene.component, reason), Vec::new());
+        return refused(PhotoLocalization::not_localized(photo, scene.component, reason));
     }
     let ground = Ground::of_scene(scene);
     let Some(found) = solve(params, (scene, &ground), photo, nearest, &matches, seed) else {
         let reason = format!("no pose explains any of its {} matches to the scene", matches.len());
-        return (PhotoLocalization::not_localized(photo, scene.component, reason), Vec::new());
+        return refused(PhotoLocalization::not_localized(photo, scene.component, reason));
     };
     let mut reasons = Vec::new();
     let mut verdict = judge_support(&params.verdict, &found.evidence, &mut reasons);
     if verdict == Verdict::NotLocalized {
-        let mut refused = PhotoLocalization::not_localized(photo, scene.component, String::new());
-        (refused.reasons, refused.inliers) = (reasons, found.evidence.inliers);
-        return (refused, Vec::new());
+        let mut answer = PhotoLocalization::not_localized(photo, scene.component, String::new());
+        (answer.reasons, answer.inliers) = (reasons, found.evidence.inliers);
+        return refused(answer);
     }
     verdict = weaker(
         verdict,
@@ -106,7 +109,7 @@ fn locate_with_nearest(
         verdict,
         reasons,
     };
-    (answer, found.inliers)
+    SingleAnswer { photo: answer, inliers: found.inliers }
 }
 
 struct Hypothesis {

@@ -175,8 +175,17 @@ pub struct SceneMatch {
     pub point: PointId,
 }
 
-/// Where one photo is by itself in one component, and what says so.
+/// Where one photo is by itself in one component.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SingleAnswer {
+    /// The answer.
+    pub photo: PhotoLocalization,
+    /// The scene points that it sees from there; empty when not localized.
+    pub inliers: Vec<SceneMatch>,
+}
+
+/// Where one photo is by itself in one component, and the scene points that it was sought by.
+#[derive(Debug, Clone, PartialEq)]
 pub struct SingleLocalization {
     /// The answer.
     pub photo: PhotoLocalization,
@@ -186,13 +195,48 @@ pub struct SingleLocalization {
     pub nearest: Vec<NearestPoints>,
 }
 
+/// What a photo says of where it is in one component before it is seen with others; borrowed.
+#[derive(Debug, Clone, Copy)]
+pub struct PhotoEvidence<'a> {
+    /// The answer by itself.
+    pub photo: &'a PhotoLocalization,
+    /// The scene points that it sees from there; empty when not localized.
+    pub inliers: &'a [SceneMatch],
+    /// The scene points nearest to each of its features, wherever it is.
+    pub nearest: &'a [NearestPoints],
+}
+
+impl SingleLocalization {
+    /// What it says to a set.
+    pub fn evidence(&self) -> PhotoEvidence<'_> {
+        PhotoEvidence { photo: &self.photo, inliers: &self.inliers, nearest: &self.nearest }
+    }
+}
+
+impl SingleAnswer {
+    /// What it says to a set, with the scene points that the photo was sought by.
+    pub fn evidence<'a>(&'a self, nearest: &'a [NearestPoints]) -> PhotoEvidence<'a> {
+        PhotoEvidence { photo: &self.photo, inliers: &self.inliers, nearest }
+    }
+}
+
+/// The scene points nearest to each feature of one photo, wherever it is.
+///
+/// They depend on nothing but its descriptors and the scene's, so that a photo can be localized again by other parameters or
+/// with another camera without another search.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct NearestAnywhere {
+    /// Those of each component of the scene, the largest first; one entry a feature.
+    pub components: Vec<Vec<NearestPoints>>,
+}
+
 /// Where one photo is by itself, in whichever component of the scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AnywhereLocalization {
     /// The answer: that of the component which says most.
     pub photo: PhotoLocalization,
     /// What each component says, the largest first.
-    pub components: Vec<SingleLocalization>,
+    pub components: Vec<SingleAnswer>,
 }
 
 /// How a local model lies in the scene.

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use setloc_features::{ImageFeatures, MatchParams, Posture, match_features};
 use setloc_sfm::{ImageId, Observation, Rigid, TwoViewKind, TwoViewParams, verify_pair};
 
-use crate::{Pictures, QueryPhoto, Scene, SingleLocalization};
+use crate::{PhotoEvidence, Pictures, QueryPhoto, Scene};
 
 /// How photos are matched with the scene's images.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -70,12 +70,12 @@ pub struct ViewGeometry {
 }
 
 /// The scene images that most features of the photos are likest to points of, up to so many, ascending.
-pub fn likely_images(scene: &Scene<'_>, alone: &[&SingleLocalization], most: usize) -> Vec<ImageId> {
+pub fn likely_images(scene: &Scene<'_>, alone: &[PhotoEvidence<'_>], most: usize) -> Vec<ImageId> {
     let mut votes: Vec<(usize, ImageId)> =
         scene.reconstruction.registered().map(|image| (0, image)).collect();
     if votes.len() > most {
         let mut of_point = vec![0_usize; scene.reconstruction.points.len()];
-        for nearest in alone.iter().flat_map(|photo| &photo.nearest).filter_map(|nearest| nearest.first) {
+        for nearest in alone.iter().flat_map(|photo| photo.nearest).filter_map(|nearest| nearest.first) {
             of_point[nearest.point.index()] += 1;
         }
         let mut of_image = vec![0; scene.reconstruction.images.len()];

@@ -1,7 +1,7 @@
 //! What the jobs hand on, as files.
 
 use serde::{Deserialize, Serialize};
-use setloc_camset::{AnywhereLocalization, Growth, SetLocalization};
+use setloc_camset::{AnywhereLocalization, Growth, NearestAnywhere, SetLocalization};
 use setloc_features::{ImageFeatures, Keypoint, Match, SimulatedView};
 use setloc_index::SceneIndex;
 use setloc_sfm::robust::TurnedCamera;
@@ -147,6 +147,7 @@ serde_artifact!(VerifiedPair, "verified pair", 1);
 serde_artifact!(TurnedPair, "turned pair", 1);
 serde_artifact!(MapperOutput, "model", 8);
 serde_artifact!(SceneIndices, "index", 2);
-serde_artifact!(AnywhereLocalization, "photo localization", 3);
+serde_artifact!(NearestAnywhere, "nearest scene points", 1);
+serde_artifact!(AnywhereLocalization, "photo localization", 4);
 serde_artifact!(Growth, "growth", 1);
 serde_artifact!(SetLocalization, "set localization", 4);

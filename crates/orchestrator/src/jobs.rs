@@ -16,7 +16,7 @@ mod scene;
 pub use features::add_features_of;
 pub use grow::{LocatedJobs, add_grown};
 pub use likely::LikelyJobs;
-pub use locate::{LocateJobs, SetJobs, add_set, add_singles};
+pub use locate::{LocateJobs, SetJobs, SingleJobs, add_set, add_singles};
 pub use matching::{PairSource, add_turned};
 pub use model::{ModelJobs, ModelKind, add_model, divided_guesses};
 pub use pairs::choose_pairs;

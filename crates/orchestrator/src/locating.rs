@@ -297,8 +297,8 @@ fn run(
                 located.skipped.push(SkippedImage { name: photo.name.clone(), reason: reason.clone() });
             }
         }
-        for job in single.iter().filter(|_| alone) {
-            let made = executor.load_made::<AnywhereLocalization>(*job)?;
+        for jobs in single.iter().filter(|_| alone) {
+            let made = executor.load_made::<AnywhereLocalization>(jobs.single)?;
             located.single.extend(made.map(|found| found.photo.clone()));
         }
         if let Some(set) = set.filter(|set| executor.output(set.set).is_some()) {

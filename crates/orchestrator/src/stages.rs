@@ -41,6 +41,8 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// what localization depends on. 22: says of parts joined across walls why. 23: adjusted to measured positions, too.
 /// 24: panoramas twist directions, too. 25: each a little by its own. 26: says how their windows are stretched.
 pub const SCENE_VERSION: u32 = 26;
+/// Version of the search for the scene points nearest to a photo's features.
+pub const NEAREST_VERSION: u32 = setloc_index::VERSION;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
 /// Version of set localization.

@@ -170,6 +170,7 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
         "local_model",
         "matches",
         "model",
+        "nearest",
         "scene",
         "single",
         "verify",
@@ -192,6 +193,7 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
             "local_model",
             "index",
             "scene",
+            "nearest",
             "single",
             "camset"
         ])

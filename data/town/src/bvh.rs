@@ -1,5 +1,7 @@
 //! A bounding volume hierarchy over the solids.
 
+use nalgebra::Vector3;
+
 use crate::geometry::{Bounds, Hit, Ray, Solid};
 
 const LEAF_SIZE: usize = 3;
@@ -14,6 +16,8 @@ struct Node {
     first: u32,
     /// Solids of a leaf; 0 for an inner node.
     count: u32,
+    /// From the centre of the right child's bounds to that of the left one's.
+    right_to_left: Vector3<f64>,
 }
 
 /// Solids ordered for quick ray queries.
@@ -48,9 +52,8 @@ impl Hierarchy {
             height -= 1;
             let index = stack[height] as usize;
             let node = &self.nodes[index];
-            match node.bounds.slabs(ray) {
-                Some((enter, _, _)) if enter < limit => {}
-                _ => continue,
+            if !node.bounds.is_entered(ray, limit) {
+                continue;
             }
             if node.count > 0 {
                 for k in node.first..node.first + node.count {
@@ -64,10 +67,8 @@ impl Hierarchy {
                 }
             } else {
                 let (left, right) = (index as u32 + 1, node.first);
-                let offset =
-                    self.nodes[left as usize].bounds.center() - self.nodes[right as usize].bounds.center();
-                let (near, far) =
-                    if offset.dot(&ray.direction) < 0.0 { (left, right) } else { (right, left) };
+                let is_left_first = node.right_to_left.dot(&ray.direction) < 0.0;
+                let (near, far) = if is_left_first { (left, right) } else { (right, left) };
                 stack[height] = far;
                 stack[height + 1] = near;
                 height += 2;
@@ -80,16 +81,19 @@ impl Hierarchy {
 fn build(boxes: &[Bounds], order: &mut [u32], offset: usize, depth: usize, nodes: &mut Vec<Node>) {
     let bounds = order.iter().skip(1).fold(boxes[order[0] as usize], |sum, &k| sum.union(&boxes[k as usize]));
     let index = nodes.len();
+    let inner = Node { bounds, first: 0, count: 0, right_to_left: Vector3::zeros() };
     if order.len() <= LEAF_SIZE {
-        nodes.push(Node { bounds, first: offset as u32, count: order.len() as u32 });
+        nodes.push(Node { first: offset as u32, count: order.len() as u32, ..inner });
         return;
     }
-    nodes.push(Node { bounds, first: 0, count: 0 });
+    nodes.push(inner);
     let middle = if depth < STACK_DEPTH / 2 { split(boxes, order) } else { order.len() / 2 };
     let (left, right) = order.split_at_mut(middle);
     build(boxes, left, offset, depth + 1, nodes);
     nodes[index].first = nodes.len() as u32;
     build(boxes, right, offset + middle, depth + 1, nodes);
+    let right = nodes[index].first as usize;
+    nodes[index].right_to_left = nodes[index + 1].bounds.center() - nodes[right].bounds.center();
 }
 
 /// Orders solids so that the first ones, as many as returned, go to the left child: the cut of least surface area heuristic

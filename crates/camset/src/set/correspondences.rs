@@ -8,7 +8,7 @@ use setloc_sfm::{PointId, Reconstruction, Rigid, Similarity};
 
 use crate::evidence::PhotoRays;
 use crate::observability::SetRay;
-use crate::{CamsetParams, SingleLocalization, Verdict};
+use crate::{CamsetParams, PhotoEvidence, Verdict};
 
 /// A scene point and the features of the set that are believed to see it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -27,7 +27,7 @@ pub(crate) fn correspondences(
     model: &Reconstruction,
     members: &[usize],
     rays: &[PhotoRays<'_>],
-    evidence: &[&SingleLocalization],
+    evidence: &[PhotoEvidence<'_>],
 ) -> Vec<SetCorrespondence> {
     let mut slot_of = vec![None; model.images.len()];
     for (slot, &photo) in members.iter().enumerate() {

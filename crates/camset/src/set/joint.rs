@@ -36,8 +36,7 @@ use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_support, weaker};
 use crate::{
-    CamsetParams, PhotoLocalization, Pictures, QueryPhoto, Scene, SceneMatch, SingleLocalization, Verdict,
-    Views,
+    CamsetParams, PhotoEvidence, PhotoLocalization, Pictures, QueryPhoto, Scene, SceneMatch, Verdict, Views,
 };
 
 /// Correspondences in a minimal sample of the generalized pose with scale.
@@ -92,7 +91,7 @@ pub(crate) struct Component<'a> {
     pub params: &'a CamsetParams,
     pub scene: &'a Scene<'a>,
     pub photos: &'a [QueryPhoto<'a>],
-    pub evidence: &'a [&'a SingleLocalization],
+    pub evidence: &'a [PhotoEvidence<'a>],
     pub model: &'a Reconstruction,
     /// Photo indices by slot, ascending.
     pub members: &'a [usize],
@@ -467,7 +466,7 @@ impl Component<'_> {
 
     /// The same of one photo.
     fn guided_of(&self, slot: usize, rays: &[PhotoRays<'_>], pose: &Rigid) -> Vec<SceneMatch> {
-        let nearest = &self.evidence[self.members[slot]].nearest;
+        let nearest = self.evidence[self.members[slot]].nearest;
         guided_matches(&self.params.guided, self.scene.index, &rays[slot], nearest, pose)
     }
 

@@ -3,32 +3,34 @@
 use super::{Answer, Remark, answer};
 use crate::anywhere::{Candidate, choose, is_rival};
 use crate::{
-    AnywhereLocalization, CamsetParams, LocalModels, PhotoLocalization, QueryPhoto, Scene, SetLocalization,
-    SingleLocalization, Verdict, VerdictParams, Views,
+    AnywhereLocalization, CamsetParams, LocalModels, NearestAnywhere, PhotoEvidence, PhotoLocalization,
+    QueryPhoto, Scene, SetLocalization, Verdict, VerdictParams, Views,
 };
 
 /// Localizes a set in the components of a scene, the largest first, of which there is at least one.
 ///
 /// As [`locate_set`](crate::locate_set) in each of them, until every photo is localized and none of the components left
 /// supports another place for a photo alone. `alone` is what
-/// [`locate_single_anywhere`](crate::locate_single_anywhere) says of each photo. `views` is asked for one component, with
-/// what is known there of each photo alone.
+/// [`locate_single_anywhere`](crate::locate_single_anywhere) says of each photo, with the scene points that it was sought
+/// by. `views` is asked for one component, with what is known there of each photo alone.
 ///
 /// # Errors
 /// Those of `views`.
-pub fn locate_set_anywhere<E>(
+pub fn locate_set_anywhere<'a, E>(
     params: &CamsetParams,
     components: &[Scene<'_>],
     photos: &[QueryPhoto<'_>],
-    alone: &[&AnywhereLocalization],
+    alone: &[(&'a AnywhereLocalization, &'a NearestAnywhere)],
     local_models: LocalModels<'_>,
-    views: impl Fn(&Scene<'_>, &[&SingleLocalization]) -> Result<Views, E>,
+    views: impl Fn(&Scene<'_>, &[PhotoEvidence<'_>]) -> Result<Views, E>,
     seed: u64,
 ) -> Result<SetLocalization, E> {
     let mut answers = Vec::new();
     for (at, scene) in components.iter().enumerate() {
-        let evidence: Vec<&SingleLocalization> =
-            alone.iter().filter_map(|photo| photo.components.get(at)).collect();
+        let of_photo = |(photo, nearest): &(&'a AnywhereLocalization, &'a NearestAnywhere)| {
+            Some(photo.components.get(at)?.evidence(nearest.components.get(at)?))
+        };
+        let evidence: Vec<PhotoEvidence<'_>> = alone.iter().filter_map(of_photo).collect();
         let of_scene = || views(scene, &evidence);
         answers.push(answer(params, scene, photos, &evidence, local_models, of_scene, seed)?);
         if is_settled(&params.verdict, &answers, alone) {
@@ -39,8 +41,12 @@ pub fn locate_set_anywhere<E>(
 }
 
 /// Whether every photo is localized, and none of the components not tried yet supports another place for one.
-fn is_settled(params: &VerdictParams, answers: &[Answer], alone: &[&AnywhereLocalization]) -> bool {
-    let is_settled = |(photo, alone): (usize, &&AnywhereLocalization)| {
+fn is_settled(
+    params: &VerdictParams,
+    answers: &[Answer],
+    alone: &[(&AnywhereLocalization, &NearestAnywhere)],
+) -> bool {
+    let is_settled = |(photo, (alone, _)): (usize, &(&AnywhereLocalization, &NearestAnywhere))| {
         let localized = answers.iter().filter_map(|answer| answer.set.refined.get(photo));
         let localized = localized.filter(|answer| answer.verdict == Verdict::Localized);
         let Some(support) = localized.map(|answer| answer.inliers).max() else { return false };
@@ -133,16 +139,23 @@ mod tests {
 
     use super::*;
     use crate::synthetic::World;
-    use crate::{SingleParams, locate_set, locate_single, locate_single_anywhere};
+    use crate::{
+        SingleLocalization, SingleParams, locate_set, locate_single, locate_single_anywhere, nearest_anywhere,
+    };
 
-    fn alone(components: &[Scene<'_>], world: &World) -> Vec<AnywhereLocalization> {
-        let locate = |photo| locate_single_anywhere(&SingleParams::default(), components, photo, 7);
+    type Alone = (AnywhereLocalization, NearestAnywhere);
+
+    fn alone(components: &[Scene<'_>], world: &World) -> Vec<Alone> {
+        let locate = |photo: &QueryPhoto<'_>| {
+            let nearest = nearest_anywhere(components, photo.features);
+            (locate_single_anywhere(&SingleParams::default(), components, photo, &nearest, 7), nearest)
+        };
         world.queries().iter().map(locate).collect()
     }
 
-    fn locate(components: &[Scene<'_>], world: &World, alone: &[AnywhereLocalization]) -> SetLocalization {
-        let alone: Vec<&AnywhereLocalization> = alone.iter().collect();
-        let views = |_: &Scene<'_>, _: &[&SingleLocalization]| Ok::<_, Infallible>(Views::default());
+    fn locate(components: &[Scene<'_>], world: &World, alone: &[Alone]) -> SetLocalization {
+        let alone: Vec<_> = alone.iter().map(|(found, nearest)| (found, nearest)).collect();
+        let views = |_: &Scene<'_>, _: &[PhotoEvidence<'_>]| Ok::<_, Infallible>(Views::default());
         let models = std::slice::from_ref(&world.local);
         let params = CamsetParams::default();
         let Ok(found) =
@@ -153,7 +166,7 @@ mod tests {
     fn in_first(world: &World) -> SetLocalization {
         let alone = |photo| locate_single(&SingleParams::default(), &world.scene(), photo, 7);
         let alone: Vec<SingleLocalization> = world.queries().iter().map(alone).collect();
-        let alone: Vec<&SingleLocalization> = alone.iter().collect();
+        let alone: Vec<PhotoEvidence<'_>> = alone.iter().map(SingleLocalization::evidence).collect();
         let views = || Ok::<_, Infallible>(Views::default());
         let (params, models) = (CamsetParams::default(), std::slice::from_ref(&world.local));
         let Ok(found) =
@@ -200,7 +213,7 @@ mod tests {
         let twins = [0, 1].map(|component| Scene { component, ..world.scene() });
         // Alone nothing supports the twin, which the set would find.
         let mut alone = alone(&twins, &world);
-        for (found, query) in alone.iter_mut().zip(world.queries()) {
+        for ((found, _), query) in alone.iter_mut().zip(world.queries()) {
             found.components[1].photo = PhotoLocalization::not_localized(&query, 1, "");
         }
         assert_eq!(locate(&twins, &world, &alone), in_first(&world));
@@ -213,11 +226,11 @@ mod tests {
         let components = [first.scene(), Scene { component: 1, ..second.scene() }];
         let alone = alone(&components, &elsewhere);
         let asked = Cell::new(0);
-        let views = |_: &Scene<'_>, _: &[&SingleLocalization]| {
+        let views = |_: &Scene<'_>, _: &[PhotoEvidence<'_>]| {
             asked.set(asked.get() + 1);
             Ok::<_, Infallible>(Views::default())
         };
-        let borrowed: Vec<&AnywhereLocalization> = alone.iter().collect();
+        let borrowed: Vec<_> = alone.iter().map(|(found, nearest)| (found, nearest)).collect();
         let (params, models) = (CamsetParams::default(), std::slice::from_ref(&elsewhere.local));
         let photos = elsewhere.queries();
         let Ok(found) =

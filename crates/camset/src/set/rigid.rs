@@ -11,7 +11,7 @@ use super::scale::{About, most_voted};
 use super::sights::Sights;
 use crate::evidence::{median, same_pose};
 use crate::observability::{Observability, observability, refine_similarity};
-use crate::{CamsetMethod, CamsetParams, SingleLocalization, Verdict};
+use crate::{CamsetMethod, CamsetParams, PhotoEvidence, Verdict};
 
 /// The rigid pose with its support.
 pub(crate) struct RigidPose {
@@ -62,7 +62,7 @@ fn agreeing_with(
 pub(crate) struct SetPhotos<'a> {
     pub set_from_camera: &'a [Rigid],
     pub members: &'a [usize],
-    pub evidence: &'a [&'a SingleLocalization],
+    pub evidence: &'a [PhotoEvidence<'a>],
 }
 
 /// Finds the pose of greatest truncated score among that of the solver and, unless `params` leave them out, others.
@@ -361,7 +361,7 @@ fn rival_of_sights(
 fn alignments(
     set_from_camera: &[Rigid],
     members: &[usize],
-    evidence: &[&SingleLocalization],
+    evidence: &[PhotoEvidence<'_>],
 ) -> Vec<Similarity> {
     let alone: Vec<(Rigid, Rigid)> = members
         .iter()

@@ -3,15 +3,13 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use serde_json::json;
-use setloc_camset::{
-    AnywhereLocalization, Growth, GrowthPhoto, PhotoLocalization, SetLocalization, SingleLocalization, grow,
-};
+use setloc_camset::{Growth, GrowthPhoto, PhotoEvidence, PhotoLocalization, SetLocalization, grow};
 use setloc_features::ImageFeatures;
 use setloc_index::IndexParams;
 use setloc_sfm::MapperOutput;
 
 use super::features::features_role;
-use super::locate::{EmptyScene, LocateJobs, SetJobs, main_of, query, single_role};
+use super::locate::{EmptyScene, LocateJobs, SetJobs, SingleJobs, alone_of, main_of, query};
 use super::scene::KEPT_FEATURES;
 use crate::codec::{self, Artifact};
 use crate::config::Config;
@@ -28,7 +26,7 @@ pub struct LocatedJobs {
     /// Features, in the order of the photos.
     pub features: Vec<JobId>,
     /// Each photo alone, in the same order.
-    pub single: Vec<JobId>,
+    pub single: Vec<SingleJobs>,
     /// The set, where it was tried.
     pub set: Option<SetJobs>,
 }
@@ -82,7 +80,7 @@ pub fn add_grown(
     graph.require(grown, "growth", growth);
     for (at, (features, single)) in located.features.iter().zip(&located.single).enumerate() {
         graph.accept(growth, features_role(at), *features);
-        graph.accept(growth, single_role(at), *single);
+        single.accepted_by(graph, growth, at);
         graph.accept(grown, features_role(at), *features);
     }
     Ok(grown)
@@ -116,21 +114,22 @@ fn growth_of(
         // Local models have the same images in the same order: those whose features exist.
         let Some(found) = inputs.find::<ImageFeatures>(&features_role(at))? else { continue };
         features.push((at, photo, found));
-        single.push(inputs.get::<AnywhereLocalization>(&single_role(at))?);
+        single.push(alone_of(inputs, at)?);
     }
     let queries: Vec<_> = features.iter().map(|(_, photo, features)| query(photo, features)).collect();
     // Only the largest component grows.
-    let by_themselves: Vec<&SingleLocalization> = single
+    let by_themselves: Vec<PhotoEvidence<'_>> = single
         .iter()
-        .map(|found| found.components.first().context("a photo was sought in no component"))
-        .collect::<Result<_>>()?;
+        .map(|(found, nearest)| Some(found.components.first()?.evidence(nearest.components.first()?)))
+        .collect::<Option<_>>()
+        .context("a photo was sought in no component")?;
     let (set, model) = if as_set {
         (Some(inputs.get::<SetLocalization>("set")?), Some(inputs.get::<MapperOutput>("local_model")?))
     } else {
         (None, None)
     };
     let of_single: Vec<PhotoLocalization> =
-        single.iter().filter(|_| alone).map(|found| found.photo.clone()).collect();
+        single.iter().filter(|_| alone).map(|(found, _)| found.photo.clone()).collect();
     let best = best_answers(&of_single, set.as_deref());
     let mut contents: BTreeSet<ContentHash> = what.scene.grown_from.iter().copied().collect();
     let answer = |(_, photo, _): &(usize, &SourceImage, Arc<ImageFeatures>)| {

@@ -4,8 +4,8 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use serde_json::json;
 use setloc_camset::{
-    AnywhereLocalization, LocalModels, QueryPhoto, Scene, SetLocalization, SingleLocalization, Views,
-    likely_images, locate_set_anywhere, locate_single_anywhere, match_views,
+    AnywhereLocalization, LocalModels, NearestAnywhere, PhotoEvidence, QueryPhoto, Scene, SetLocalization,
+    Views, likely_images, locate_set_anywhere, locate_single_anywhere, match_views, nearest_anywhere,
 };
 use setloc_features::{Camera, ImageFeatures};
 use setloc_index::SceneIndex;
@@ -41,9 +41,18 @@ pub struct SetJobs {
     /// Features and local model.
     pub model: ModelJobs,
     /// Each photo alone, in the order of the photos.
-    pub single: Vec<JobId>,
+    pub single: Vec<SingleJobs>,
     /// The set's localization.
     pub set: JobId,
+}
+
+/// The jobs of one photo alone.
+#[derive(Debug, Clone, Copy)]
+pub struct SingleJobs {
+    /// The scene points nearest to its features.
+    pub nearest: JobId,
+    /// Its localization by them.
+    pub single: JobId,
 }
 
 /// Adds features, matches, local model, localization of each photo alone and of the set; `name` is what its jobs are
@@ -83,7 +92,7 @@ pub fn add_set(
     graph.require(set, "local_model", model.model);
     for (at, (features, single)) in model.features.iter().zip(&single).enumerate() {
         graph.accept(set, features_role(at), *features);
-        graph.accept(set, single_role(at), *single);
+        single.accepted_by(graph, set, at);
     }
     Ok(SetJobs { model, single, set })
 }
@@ -103,10 +112,9 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
         // The local model has the same images in the same order: those whose features exist.
         let Some(found) = inputs.find::<ImageFeatures>(&features_role(at))? else { continue };
         features.push((photo, found));
-        let by_itself = inputs.find::<AnywhereLocalization>(&single_role(at))?;
-        alone.push(by_itself.with_context(|| format!("{} was not located alone", photo.name))?);
+        alone.push(alone_of(inputs, at).with_context(|| format!("{} was not located alone", photo.name))?);
     }
-    let alone: Vec<&AnywhereLocalization> = alone.iter().map(|found| &**found).collect();
+    let alone: Vec<_> = alone.iter().map(|(found, nearest)| (&**found, &**nearest)).collect();
     let queries: Vec<QueryPhoto<'_>> =
         features.iter().map(|(photo, features)| query(photo, features)).collect();
     let photos: Vec<&SourceImage> = features.iter().map(|(photo, _)| *photo).collect();
@@ -115,7 +123,7 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
     let at_hand = PicturesAtHand::new(&what.pictures, &photos);
     let pictures = at_hand.of(&components);
     let seed = derived_seed(what.seed, &["camset"]);
-    let views = |scene: &Scene<'_>, alone: &[&SingleLocalization]| -> Result<Views> {
+    let views = |scene: &Scene<'_>, alone: &[PhotoEvidence<'_>]| -> Result<Views> {
         let likely = likely_images(scene, alone, what.config.camset.views.max_images);
         let read = |image: usize| match likely.binary_search(&ImageId(image as u32)) {
             Ok(_) => what.scene.features_of(ImageId(image as u32)),
@@ -144,38 +152,81 @@ pub fn add_singles(
     photos: &[SourceImage],
     features: &[JobId],
     what: &LocateJobs,
-) -> Vec<JobId> {
+) -> Vec<SingleJobs> {
     photos.iter().zip(features).map(|(photo, features)| add_single(graph, photo, *features, what)).collect()
 }
 
-fn add_single(graph: &mut JobGraph<'_>, photo: &SourceImage, features: JobId, what: &LocateJobs) -> JobId {
+fn add_single(
+    graph: &mut JobGraph<'_>,
+    photo: &SourceImage,
+    features: JobId,
+    what: &LocateJobs,
+) -> SingleJobs {
+    let scene = BTreeMap::from([("scene".to_owned(), what.scene.content)]);
+    let of_scene = Arc::clone(&what.scene);
+    let work = move |inputs: &Inputs<'_, '_>| {
+        let features = inputs.get::<ImageFeatures>("features")?;
+        let empty = EmptyScene::default();
+        Product::new(nearest_anywhere(&components_of(&of_scene, &empty), &features))
+    };
+    let nearest = graph.add(Job {
+        kind: "nearest",
+        version: stages::NEAREST_VERSION,
+        name: photo.name.clone(),
+        params: json!({}),
+        external: scene.clone(),
+        memory: 32 << 20,
+        work: Box::new(work),
+    });
+    graph.require(nearest, "features", features);
     let camera = json!([photo.name, photo.camera, photo.calibration]);
     let params = json!({ "single": what.config.single, "seed": what.seed, "photo": camera });
     let (owned, what_here) = (photo.clone(), what.clone());
     let work = move |inputs: &Inputs<'_, '_>| {
         let features = inputs.get::<ImageFeatures>("features")?;
+        let nearest = inputs.get::<NearestAnywhere>("nearest")?;
         let empty = EmptyScene::default();
         let components = components_of(&what_here.scene, &empty);
         let seed = derived_seed(what_here.seed, &["single", &owned.hash.to_string()]);
         let (params, photo) = (&what_here.config.single, query(&owned, &features));
-        Product::new(locate_single_anywhere(params, &components, &photo, seed))
+        Product::new(locate_single_anywhere(params, &components, &photo, &nearest, seed))
     };
     let single = graph.add(Job {
         kind: "single",
         version: stages::SINGLE_VERSION,
         name: photo.name.clone(),
         params,
-        external: BTreeMap::from([("scene".to_owned(), what.scene.content)]),
+        external: scene,
         memory: 32 << 20,
         work: Box::new(work),
     });
     graph.require(single, "features", features);
-    single
+    graph.require(single, "nearest", nearest);
+    SingleJobs { nearest, single }
 }
 
-/// The role of the localization of a photo alone.
-pub(super) fn single_role(photo: usize) -> String {
+impl SingleJobs {
+    /// Lets a job use what they make of a photo, if they do.
+    pub(super) fn accepted_by(self, graph: &mut JobGraph<'_>, job: JobId, photo: usize) {
+        graph.accept(job, single_role(photo), self.single);
+        graph.accept(job, nearest_role(photo), self.nearest);
+    }
+}
+
+/// What the jobs of a photo alone made of it.
+pub(super) fn alone_of(
+    inputs: &Inputs<'_, '_>,
+    photo: usize,
+) -> Result<(Arc<AnywhereLocalization>, Arc<NearestAnywhere>)> {
+    Ok((inputs.get(&single_role(photo))?, inputs.get(&nearest_role(photo))?))
+}
+
+fn single_role(photo: usize) -> String {
     format!("single {photo:04}")
+}
+
+fn nearest_role(photo: usize) -> String {
+    format!("nearest {photo:04}")
 }
 
 pub(super) fn query<'a>(photo: &'a SourceImage, features: &'a ImageFeatures) -> QueryPhoto<'a> {

@@ -8,7 +8,7 @@ use crate::graph::{Event, Observer};
 use crate::print;
 
 /// Stages in the order they are shown.
-const STAGES: [&str; 11] = [
+const STAGES: [&str; 12] = [
     "features",
     "matches",
     "turned",
@@ -18,6 +18,7 @@ const STAGES: [&str; 11] = [
     "local_model",
     "index",
     "scene",
+    "nearest",
     "single",
     "camset",
 ];

@@ -151,7 +151,7 @@ impl Component<'_> {
 
     /// What the photo alone says, where it is localized.
     fn localized_alone(&self, slot: usize) -> Option<&PhotoLocalization> {
-        Some(&self.evidence[self.members[slot]].photo).filter(|alone| alone.verdict == Verdict::Localized)
+        Some(self.evidence[self.members[slot]].photo).filter(|alone| alone.verdict == Verdict::Localized)
     }
 
     /// Whether the photo stands at the same place when localized alone; `None` when it is not.

@@ -90,8 +90,8 @@ mod tests {
 
     use crate::synthetic::{Place, World};
     use crate::{
-        CamsetParams, LocalModels, Picture, Pictures, SetLocalization, SingleParams, Verdict, Views,
-        locate_set, locate_single,
+        CamsetParams, LocalModels, Picture, Pictures, SetLocalization, SingleLocalization, SingleParams,
+        Verdict, Views, locate_set, locate_single,
     };
 
     /// Half of the distance between the walls of a street.
@@ -130,7 +130,7 @@ mod tests {
         let (scene, photos) = (world.scene(), world.queries());
         let alone: Vec<_> =
             photos.iter().map(|photo| locate_single(&SingleParams::default(), &scene, photo, 7)).collect();
-        let alone: Vec<_> = alone.iter().collect();
+        let alone: Vec<_> = alone.iter().map(SingleLocalization::evidence).collect();
         let located = |pictures: Option<&Pictures>| -> SetLocalization {
             let models = LocalModels { pictures, ..std::slice::from_ref(&world.local).into() };
             let views = || Ok::<_, Infallible>(Views::default());

@@ -66,7 +66,7 @@ impl Component<'_> {
             .with_max_len(1)
             .map(|slot| {
                 let pose = &model.photos[slot].world_from_camera;
-                let nearest = &self.evidence[self.members[slot]].nearest;
+                let nearest = self.evidence[self.members[slot]].nearest;
                 guided_matches(&guided_params, index, &rays[slot], nearest, pose)
             })
             .collect();
