@@ -58,7 +58,7 @@ impl Bounds {
         (enter <= exit && exit > 0.0).then_some((enter, exit, axis))
     }
 
-    /// Whether a ray enters nearer than `limit`: [`Self::slabs`] in the innermost loop, without branches.
+    /// Whether a ray enters nearer than `limit`: what the innermost loop needs of [`Self::slabs`].
     pub fn is_entered(&self, ray: &Ray, limit: f64) -> bool {
         let (mut enter, mut exit) = (f64::NEG_INFINITY, f64::INFINITY);
         for k in 0..3 {
