@@ -20,8 +20,8 @@ pub fn nearest_anywhere(components: &[Scene<'_>], features: &ImageFeatures) -> N
 
 /// Localizes one photo alone in each component, and takes the answer of the one that says most.
 ///
-/// `components` has at least one, the largest first, and `nearest` is what [`nearest_anywhere`] finds in them. Where another component supports another place nearly as well, the
-/// answer is *uncertain*, as it is where two places of one component do.
+/// `components` has at least one, the largest first, and `nearest` is what [`nearest_anywhere`] finds in them. Where another
+/// component supports another place nearly as well, the answer is *uncertain*, as it is where two places of one component do.
 pub fn locate_single_anywhere(
     params: &SingleParams,
     components: &[Scene<'_>],

@@ -52,8 +52,9 @@ impl Hierarchy {
             height -= 1;
             let index = stack[height] as usize;
             let node = &self.nodes[index];
-            if !node.bounds.is_entered(ray, limit) {
-                continue;
+            match node.bounds.slabs(ray) {
+                Some((enter, _, _)) if enter < limit => {}
+                _ => continue,
             }
             if node.count > 0 {
                 for k in node.first..node.first + node.count {

@@ -57,19 +57,6 @@ impl Bounds {
         }
         (enter <= exit && exit > 0.0).then_some((enter, exit, axis))
     }
-
-    /// Whether a ray enters nearer than `limit`: what the innermost loop needs of [`Self::slabs`].
-    pub fn is_entered(&self, ray: &Ray, limit: f64) -> bool {
-        let (mut enter, mut exit) = (f64::NEG_INFINITY, f64::INFINITY);
-        for k in 0..3 {
-            let a = (self.min[k] - ray.origin[k]) * ray.inverse[k];
-            let b = (self.max[k] - ray.origin[k]) * ray.inverse[k];
-            let (near, far) = if a < b { (a, b) } else { (b, a) };
-            enter = if near > enter { near } else { enter };
-            exit = if far < exit { far } else { exit };
-        }
-        enter <= exit && exit > 0.0 && enter < limit
-    }
 }
 
 /// Which part of a solid a ray met.
