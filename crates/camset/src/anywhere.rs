@@ -139,7 +139,7 @@ mod tests {
     fn a_photo_of_the_second_component_is_localized_there() {
         let (other, world) = (World::chain(2, 0.2, 31), World::chain(2, 0.2, 32));
         let second = Scene { component: 1, ..world.scene() };
-        let alone = locate_single(&SingleParams::default(), &second, &world.queries()[0], 3).photo;
+        let alone = locate_single(&SingleParams::default(), &second, &world.queries()[0], 3).answer.photo;
         let found = locate(&[other.scene(), second], &world.queries()[0]);
         assert_eq!((found.verdict, found.component), (Verdict::Localized, 1), "{found:#?}");
         assert_eq!(found, alone);
@@ -176,7 +176,7 @@ mod tests {
         let world = World::chain(1, 0.2, 37);
         let answer = |component| {
             let scene = Scene { component, ..world.scene() };
-            locate_single(&SingleParams::default(), &scene, &world.queries()[0], 3).photo
+            locate_single(&SingleParams::default(), &scene, &world.queries()[0], 3).answer.photo
         };
         let answers = [answer(0), answer(1)];
         let verdict = |seen: [&[(usize, usize)]; 2]| {

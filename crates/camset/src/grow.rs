@@ -412,7 +412,8 @@ mod tests {
             let world = World::chain(7, 0.2, seed as u64);
             let after = grown(&world, &growth_of(&world, 6));
             let photo = &world.queries()[6];
-            let locate = |scene: &Scene<'_>| locate_single(&SingleParams::default(), scene, photo, 7).photo;
+            let locate =
+                |scene: &Scene<'_>| locate_single(&SingleParams::default(), scene, photo, 7).answer.photo;
             assert_ne!(locate(&world.scene()).verdict, Verdict::Localized, "{seed}");
             let answer = locate(&scene_of(&after));
             localized += usize::from(answer.verdict == Verdict::Localized);

@@ -201,7 +201,7 @@ mod tests {
                 let scene = Scene { errors, ..world.scene() };
                 let photo = world.queries()[0];
                 let found = crate::locate_single(&crate::SingleParams::default(), &scene, &photo, 1);
-                found.photo.covariance.expect("is localized").fixed_view::<3, 3>(0, 0).trace()
+                found.answer.photo.covariance.expect("is localized").fixed_view::<3, 3>(0, 0).trace()
             };
             alone(Some(&errors)) - alone(None)
         };
@@ -220,7 +220,7 @@ mod tests {
             let scene = Scene { errors, ..world.scene() };
             let photo = world.queries()[0];
             let found = crate::locate_single(&crate::SingleParams::default(), &scene, &photo, 1);
-            found.photo.covariance.expect("is localized")
+            found.answer.photo.covariance.expect("is localized")
         };
         let (motion, poses) = moved_together(&world, 16);
         let errors = ModelErrors::new(0.0, poses);

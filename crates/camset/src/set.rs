@@ -511,7 +511,7 @@ mod tests {
 
     fn move_by(metres: f64) -> impl Fn(&mut SingleLocalization) {
         move |alone| {
-            if let Some(pose) = &mut alone.photo.world_from_camera {
+            if let Some(pose) = &mut alone.answer.photo.world_from_camera {
                 pose.translation.z += metres;
             }
         }
@@ -522,7 +522,8 @@ mod tests {
         let world = World::chain(9, 0.2, 1);
         let located = |moved: usize, metres: f64| {
             locate_with_alone(&world, |alone| {
-                let localized = |photo: &&mut SingleLocalization| photo.photo.verdict == Verdict::Localized;
+                let localized =
+                    |photo: &&mut SingleLocalization| photo.answer.photo.verdict == Verdict::Localized;
                 alone.iter_mut().rev().filter(localized).take(moved).for_each(move_by(metres));
             })
         };
@@ -535,18 +536,18 @@ mod tests {
             let (alone, found) = located(2, metres);
             let mut doubted = Vec::new();
             for (photo, alone) in found.refined.iter().zip(&alone) {
-                if alone.photo.verdict != Verdict::Localized {
+                if alone.answer.photo.verdict != Verdict::Localized {
                     assert_ne!(photo.verdict, Verdict::Localized, "{photo:?}");
                     continue;
                 }
-                assert_eq!(photo.world_from_camera, alone.photo.world_from_camera);
+                assert_eq!(photo.world_from_camera, alone.answer.photo.world_from_camera);
                 if photo.verdict != Verdict::Localized {
                     assert!(photo.reasons.join("; ").contains("with more matches"), "{photo:?}");
                     doubted.push(photo.name.as_str());
                 }
             }
-            let localized = |alone: &&SingleLocalization| alone.photo.verdict == Verdict::Localized;
-            let names = alone.iter().rev().filter(localized).map(|alone| alone.photo.name.as_str());
+            let localized = |alone: &&SingleLocalization| alone.answer.photo.verdict == Verdict::Localized;
+            let names = alone.iter().rev().filter(localized).map(|alone| alone.answer.photo.name.as_str());
             let mut moved: Vec<&str> = names.take(outweighed).collect();
             moved.reverse();
             assert_eq!(doubted, moved, "moved by {metres} m");
@@ -562,9 +563,9 @@ mod tests {
         // All but one in 60 scene points have another that is as like, for the ratio test.
         let (_, found) = locate_with_alone(&world, |alone| {
             for alone in alone {
-                alone.photo.verdict = Verdict::NotLocalized;
-                alone.photo.world_from_camera = None;
-                alone.inliers.clear();
+                alone.answer.photo.verdict = Verdict::NotLocalized;
+                alone.answer.photo.world_from_camera = None;
+                alone.answer.inliers.clear();
                 for nearest in &mut alone.nearest {
                     let repeated = nearest.first.filter(|first| !first.point.0.is_multiple_of(60));
                     if let Some(first) = repeated {
@@ -602,7 +603,7 @@ mod tests {
                 let expected = if is_doubted { Verdict::Uncertain } else { Verdict::Localized };
                 assert_eq!(photo.verdict, expected, "{photo:?}");
             }
-            let alone = alone.iter().map(|alone| &alone.photo);
+            let alone = alone.iter().map(|alone| &alone.answer.photo);
             for photo in alone.chain(&set.refined).filter(|photo| photo.world_from_camera.is_some()) {
                 assert_eq!(photo.reasons.join("; ").contains("may be folded"), is_doubted, "{photo:?}");
                 assert!(!is_doubted || photo.verdict == Verdict::Uncertain, "{photo:?}");
@@ -619,9 +620,9 @@ mod tests {
         let world = World::new(&Place::street(3500, 11), &(0..8).map(turned).collect::<Vec<_>>(), 0.2, 11);
         let (alone, found) = locate_with_alone(&world, |alone| {
             move_by(8.0)(&mut alone[0]);
-            alone[1].photo.verdict = Verdict::Uncertain;
+            alone[1].answer.photo.verdict = Verdict::Uncertain;
         });
-        assert_eq!(alone[0].photo.verdict, Verdict::Localized);
+        assert_eq!(alone[0].answer.photo.verdict, Verdict::Localized);
         assert_eq!(found.contradicted, [found.refined[0].name.clone()]);
         assert!(found.refined[..2].iter().all(|photo| photo.verdict == Verdict::Uncertain));
         let said = |at: usize| found.refined[at].reasons.join("; ");
@@ -633,7 +634,8 @@ mod tests {
     #[test]
     fn the_ground_alone_localizes_neither_photo_nor_set() {
         let alone = |world: &World| {
-            let photo = locate_single(&SingleParams::default(), &world.scene(), &world.queries()[0], 7).photo;
+            let photo =
+                locate_single(&SingleParams::default(), &world.scene(), &world.queries()[0], 7).answer.photo;
             (photo.verdict, photo.reasons.join("; "))
         };
         for standing in [0.0, 0.2] {
@@ -707,7 +709,7 @@ mod tests {
             let mut world = World::chain(1, 0.2, seed);
             world.forget_seen_points();
             let alone = locate_single(&SingleParams::default(), &world.scene(), &world.queries()[0], 7);
-            assert_ne!(alone.photo.verdict, Verdict::Localized);
+            assert_ne!(alone.answer.photo.verdict, Verdict::Localized);
             let locate = |panoramas: &[u32]| {
                 let views = || world.views(panoramas);
                 let params = CamsetParams::default();
@@ -876,7 +878,8 @@ mod tests {
             assert!(reasons.iter().any(|reason| reason.contains("80 matches")), "{reasons:?}");
         }
         // Photos that are localized alone stay so on the other side.
-        let by_themselves = alone.iter().filter(|found| found.photo.verdict == Verdict::Localized).count();
+        let by_themselves =
+            alone.iter().filter(|found| found.answer.photo.verdict == Verdict::Localized).count();
         assert!(by_themselves >= 2 && verdicts(&locate(first_photos(1)))[..2] == [true; 2]);
         // By far more matches speak against those, too, that share points with them and that the scene does not hold.
         let found = locate_with(300, first_photos(6));

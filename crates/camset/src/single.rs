@@ -50,8 +50,8 @@ pub fn locate_single(
     seed: u64,
 ) -> SingleLocalization {
     let nearest = scene.index.nearest_points(&photo.features.descriptors);
-    let SingleAnswer { photo, inliers } = locate_with_nearest(params, scene, photo, &nearest, seed);
-    SingleLocalization { photo, inliers, nearest }
+    let answer = locate_with_nearest(params, scene, photo, &nearest, seed);
+    SingleLocalization { answer, nearest }
 }
 
 /// [`locate_single`] where the nearest scene points of all features are known.
@@ -409,7 +409,7 @@ mod tests {
     use crate::synthetic::{World, along_street};
 
     fn locate(world: &World, photo: usize) -> PhotoLocalization {
-        locate_single(&SingleParams::default(), &world.scene(), &world.queries()[photo], 3).photo
+        locate_single(&SingleParams::default(), &world.scene(), &world.queries()[photo], 3).answer.photo
     }
 
     #[test]
@@ -450,7 +450,7 @@ mod tests {
         guess.params[0] = 640.0;
         guess.params[1] = 640.0;
         let query = QueryPhoto { camera: &guess, calibration: Calibration::Guessed, ..world.queries()[0] };
-        let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5).photo;
+        let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5).answer.photo;
         assert!((found.camera.params[0] / 800.0 - 1.0).abs() < 0.01, "{:?}", found.camera.params);
         let (center, rotation) = world.errors(0, &found.world_from_camera.unwrap());
         assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
@@ -466,7 +466,7 @@ mod tests {
             let guess = Camera::from_focal_guess(1200, 900, 1440.0);
             let (name, calibration) = ("photo", Calibration::Guessed);
             let query = QueryPhoto { name, camera: &guess, calibration, features: &view.features };
-            let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5).photo;
+            let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5).answer.photo;
             assert_eq!(found.verdict, Verdict::Localized, "{found:#?}");
             let found_pose = found.world_from_camera.unwrap();
             let off = (found_pose.translation - pose.translation).norm();
@@ -487,12 +487,12 @@ mod tests {
             let elsewhere = World::chain(2, 0.2, 200 + seed);
             let query = &elsewhere.queries()[0];
             let found = locate_single(&SingleParams::default(), &world.scene(), query, seed);
-            assert_eq!(found.photo.verdict, Verdict::NotLocalized);
-            assert!(found.inliers.is_empty());
+            assert_eq!(found.answer.photo.verdict, Verdict::NotLocalized);
+            assert!(found.answer.inliers.is_empty());
         }
         let empty = setloc_features::ImageFeatures::default();
         let query = QueryPhoto { features: &empty, ..world.queries()[0] };
         let found = locate_single(&SingleParams::default(), &world.scene(), &query, 1);
-        assert_eq!(found.photo.verdict, Verdict::NotLocalized);
+        assert_eq!(found.answer.photo.verdict, Verdict::NotLocalized);
     }
 }

@@ -187,10 +187,8 @@ pub struct SingleAnswer {
 /// Where one photo is by itself in one component, and the scene points that it was sought by.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SingleLocalization {
-    /// The answer.
-    pub photo: PhotoLocalization,
-    /// The scene points that it sees from there; empty when not localized.
-    pub inliers: Vec<SceneMatch>,
+    /// Where it is.
+    pub answer: SingleAnswer,
     /// The scene points nearest to each of its features, wherever it is.
     pub nearest: Vec<NearestPoints>,
 }
@@ -209,7 +207,7 @@ pub struct PhotoEvidence<'a> {
 impl SingleLocalization {
     /// What it says to a set.
     pub fn evidence(&self) -> PhotoEvidence<'_> {
-        PhotoEvidence { photo: &self.photo, inliers: &self.inliers, nearest: &self.nearest }
+        self.answer.evidence(&self.nearest)
     }
 }
 

@@ -14,7 +14,7 @@ use crate::dataset::{ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Executor, JobGraph, RunResult};
-use crate::jobs::{ApartJob, LikelyJobs, SceneJobs, SceneModelJobs, add_first_model, add_scene};
+use crate::jobs::{ApartJob, LikelyJobs, SceneInputs, SceneJobs, SceneModelJobs, add_first_model, add_scene};
 use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::stages::FeatureParams;
@@ -82,7 +82,8 @@ pub fn build_scene(
 ) -> Result<BuildOutcome> {
     let SceneSource { folder, config, seed, name, .. } = source;
     let (alike, before) = alike_pairs(session, name, &folder.images, &config.features, config)?;
-    let (calibrated, first) = estimate_cameras(session, name, &folder.images, &alike, config, seed)?;
+    let given = SceneInputs { images: &folder.images, alike: &alike, config, seed };
+    let (calibrated, first) = estimate_cameras(session, name, given)?;
     let images = calibrated.as_deref().unwrap_or(&folder.images);
     let mut passes = Passes { session, source, alike: &alike, run: before.and(first), export };
     let mut pass = passes.pass(images, |left| !config.looks_again(left))?;
@@ -134,7 +135,8 @@ impl<Export: FnMut(&Built) -> Result<()>> Passes<'_, Export> {
     ) -> Result<Pass> {
         let SceneSource { folder, config, seed, name, present } = self.source;
         let mut graph = JobGraph::default();
-        let jobs = add_scene(&mut graph, images, self.alike, config, seed)?;
+        let inputs = SceneInputs { images, alike: self.alike, config, seed };
+        let jobs = add_scene(&mut graph, inputs)?;
         graph.want(jobs.scene);
         graph.want_file(jobs.scene);
         graph.want(jobs.apart.job);
@@ -212,15 +214,13 @@ pub fn has_guessed_cameras(images: &[SourceImage]) -> bool {
 pub fn estimate_cameras(
     session: &Session,
     name: &str,
-    images: &[SourceImage],
-    alike: &[(usize, usize)],
-    config: &Config,
-    seed: u64,
+    inputs: SceneInputs<'_>,
 ) -> Result<(Option<Vec<SourceImage>>, RunResult)> {
-    if !has_guessed_cameras(images) {
+    let SceneInputs { alike, config, seed, .. } = inputs;
+    if !has_guessed_cameras(inputs.images) {
         return Ok((None, RunResult::default()));
     }
-    let mut images = images.to_vec();
+    let mut images = inputs.images.to_vec();
     // Where pairs are chosen by place, others need not be matched.
     let by_turns = if images.iter().all(|image| image.position.is_none()) {
         guess_by_turns(session, name, &mut images, alike, (&config.features, config), seed)?
@@ -229,7 +229,7 @@ pub fn estimate_cameras(
     };
     let images = &images;
     let mut graph = JobGraph::default();
-    let jobs = add_first_model(&mut graph, images, alike, config, seed)?;
+    let jobs = add_first_model(&mut graph, SceneInputs { images, ..inputs })?;
     let (told, doubtful, first) = session.run(name, &graph, |executor, run| {
         let model = executor.load_made::<MapperOutput>(jobs.model)?;
         let doubtful = model.as_ref().is_some_and(|model| !model.report.doubtful.is_empty());
@@ -241,7 +241,7 @@ pub fn estimate_cameras(
         told => return Ok((told, first)),
     };
     let mut graph = JobGraph::default();
-    let jobs = add_first_model(&mut graph, &told, alike, config, seed)?;
+    let jobs = add_first_model(&mut graph, SceneInputs { images: &told, ..inputs })?;
     session.run(name, &graph, |executor, run| {
         let model = executor.load_made::<MapperOutput>(jobs.model)?;
         let better = model.and_then(|model| with_estimated_cameras(&told, &jobs, &model));

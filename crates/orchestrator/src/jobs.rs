@@ -8,10 +8,12 @@ mod likely;
 mod locate;
 mod matching;
 mod model;
+mod notes;
 mod pairs;
 mod pixels;
 mod positions;
 mod scene;
+mod scene_file;
 
 pub use features::add_features_of;
 pub use grow::{LocatedJobs, add_grown};
@@ -20,7 +22,9 @@ pub use locate::{LocateJobs, SetJobs, SingleJobs, add_set, add_singles};
 pub use matching::{PairSource, add_turned};
 pub use model::{ModelJobs, ModelKind, add_model, divided_guesses};
 pub use pairs::choose_pairs;
-pub use scene::{ApartJob, SceneJobs, SceneModelJobs, add_first_model, add_model_apart, add_scene};
+pub use scene::{
+    ApartJob, SceneInputs, SceneJobs, SceneModelJobs, add_first_model, add_model_apart, add_scene,
+};
 
 use crate::fingerprint::ContentHash;
 

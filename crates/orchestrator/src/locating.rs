@@ -14,7 +14,7 @@ use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, with_
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, RunResult};
 use crate::jobs::{
-    LocateJobs, LocatedJobs, add_features_of, add_grown, add_set, add_singles, divided_guesses,
+    LocateJobs, LocatedJobs, SceneInputs, add_features_of, add_grown, add_set, add_singles, divided_guesses,
 };
 use crate::scene::SceneFile;
 use crate::session::Session;
@@ -220,7 +220,8 @@ fn improve_by_model(
 ) -> Result<RunResult> {
     let config = Config { features: what.config.photo_features(), ..what.config.clone() };
     let (alike, before) = alike_pairs(session, name, images, &config.features, &config)?;
-    let (told, run) = estimate_cameras(session, name, images, &alike, &config, what.seed)?;
+    let inputs = SceneInputs { images, alike: &alike, config: &config, seed: what.seed };
+    let (told, run) = estimate_cameras(session, name, inputs)?;
     let told = told.into_iter().flatten();
     for ((image, told), _) in images.iter_mut().zip(told).zip(which).filter(|(_, is_meant)| **is_meant) {
         image.camera = told.camera;

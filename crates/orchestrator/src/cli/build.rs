@@ -21,7 +21,7 @@ use crate::error::Hinted;
 use crate::export::{Marker, colmap_lacks, ply, remove_colmap, renew_colmap, scene_json, top_view_png};
 use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, Prediction};
-use crate::jobs::{LikelyJobs, add_first_model, add_model_apart, add_scene};
+use crate::jobs::{LikelyJobs, SceneInputs, add_first_model, add_model_apart, add_scene};
 use crate::pictures::PictureBook;
 use crate::print;
 use crate::scene::SceneFile;
@@ -109,7 +109,9 @@ pub fn plan(args: &PlanArgs) -> Result<Answer> {
     let store = Store::at(&cache_folder(args.source.run.cache.as_deref(), &args.source.output));
     let name = store.name_of("build", &args.source.output);
     let alike = stored_alike_pairs(args, &folder, &config, (&store, &name))?;
-    let graph = next_jobs(args, &folder, &alike, &config, (&store, &name))?;
+    let (images, seed) = (&folder.images[..], args.source.run.seed);
+    let inputs = SceneInputs { images, alike: &alike, config: &config, seed };
+    let graph = next_jobs(args, inputs, (&store, &name))?;
     if args.format == PlanFormat::Dot {
         print::data(graph.to_dot().trim_end())?;
         return Ok(Answer::Done);
@@ -165,34 +167,31 @@ fn stored_alike_pairs(
 /// stored. Where its model is torn, those of the second pass, as long as that may tell more.
 fn next_jobs<'g>(
     args: &PlanArgs,
-    folder: &ImageFolder,
-    alike: &[(usize, usize)],
-    config: &Config,
+    inputs: SceneInputs<'_>,
     (store, name): (&Store, &str),
 ) -> Result<JobGraph<'g>> {
-    let seed = args.source.run.seed;
     let session = || args.source.run.session(&args.source.output, None);
     let mut told = None;
-    if has_guessed_cameras(&folder.images) {
+    if has_guessed_cameras(inputs.images) {
         let mut graph = JobGraph::default();
-        add_first_model(&mut graph, &folder.images, alike, config, seed)?;
+        add_first_model(&mut graph, inputs)?;
         if !is_stored(&graph, store) {
             print::note("cameras are estimated by a first model, and what follows from them is not listed");
             return Ok(graph);
         }
-        told = estimate_cameras(&session()?, name, &folder.images, alike, config, seed)?.0;
+        told = estimate_cameras(&session()?, name, inputs)?.0;
     }
-    let images = told.as_deref().unwrap_or(&folder.images);
+    let images = told.as_deref().unwrap_or(inputs.images);
     let apart_where_stored = |images: &[SourceImage]| {
         let mut graph = JobGraph::default();
-        let apart = add_model_apart(&mut graph, images, alike, config, seed)?;
+        let apart = add_model_apart(&mut graph, SceneInputs { images, ..inputs })?;
         graph.want(apart.job);
         if !is_stored(&graph, store) {
             return Ok(None);
         }
         left_apart(&session()?, name, (&graph, &apart), images)
     };
-    let first = apart_where_stored(images)?.filter(|(first, _)| config.looks_again(first));
+    let first = apart_where_stored(images)?.filter(|(first, _)| inputs.config.looks_again(first));
     let again = match &first {
         Some((first, again)) => {
             let second = apart_where_stored(again)?;
@@ -201,7 +200,8 @@ fn next_jobs<'g>(
         None => None,
     };
     let mut graph = JobGraph::default();
-    add_scene(&mut graph, again.map_or(images, Vec::as_slice), alike, config, seed)?;
+    let images = again.map_or(images, Vec::as_slice);
+    add_scene(&mut graph, SceneInputs { images, ..inputs })?;
     Ok(graph)
 }
 

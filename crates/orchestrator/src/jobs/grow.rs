@@ -10,7 +10,7 @@ use setloc_sfm::MapperOutput;
 
 use super::features::features_role;
 use super::locate::{EmptyScene, LocateJobs, SetJobs, SingleJobs, alone_of, main_of, query};
-use super::scene::KEPT_FEATURES;
+use super::scene_file::KEPT_FEATURES;
 use crate::codec::{self, Artifact};
 use crate::config::Config;
 use crate::dataset::SourceImage;
