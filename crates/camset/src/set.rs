@@ -406,6 +406,7 @@ mod tests {
     use super::*;
     use crate::jackknife::deviation;
     use crate::synthetic::{Place, World, along_street};
+    use crate::types::DOUBTFUL;
     use crate::{CamsetMethod, PathToScene, SingleLocalization, SingleParams, locate_single};
 
     fn locate_photos(
@@ -585,7 +586,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_seen_where_the_scene_may_be_folded_is_uncertain() {
+    fn what_is_seen_where_the_scene_may_be_wrong_is_uncertain() {
         let world = World::chain(6, 0.2, 1);
         let all: Vec<ImageId> = world.scene().reconstruction.registered().collect();
         for doubtful in [&all[..1], &all[..]] {
@@ -605,7 +606,7 @@ mod tests {
             }
             let alone = alone.iter().map(|alone| &alone.answer.photo);
             for photo in alone.chain(&set.refined).filter(|photo| photo.world_from_camera.is_some()) {
-                assert_eq!(photo.reasons.join("; ").contains("may be folded"), is_doubted, "{photo:?}");
+                assert_eq!(photo.reasons.join("; ").contains(DOUBTFUL), is_doubted, "{photo:?}");
                 assert!(!is_doubted || photo.verdict == Verdict::Uncertain, "{photo:?}");
             }
         }

@@ -21,7 +21,8 @@ pub struct Scene<'a> {
     pub index: &'a SceneIndex,
     /// Which of its images are photos that it has grown by; ascending, and after all others.
     pub grown: &'a [GrownImage],
-    /// Images about which it may be folded ([`setloc_sfm::doubtful_images`]); ascending.
+    /// Images about which it may be folded ([`setloc_sfm::doubtful_images`]), or that nothing confirms
+    /// ([`setloc_sfm::UnconfirmedPair`]); ascending.
     pub doubtful: &'a [ImageId],
     /// What it may be off, where that is told.
     pub errors: Option<&'a ModelErrors>,
@@ -45,8 +46,7 @@ impl Scene<'_> {
 }
 
 /// Said of a photo that sees most of all what doubtful images of the scene see.
-pub(crate) const DOUBTFUL: &str =
-    "the scene may be folded where it is: many matches of its images contradict the model there";
+pub(crate) const DOUBTFUL: &str = "the scene may be wrong where it is, as a warning of its build says";
 
 /// An image of the scene that is a photo localized in the scene as it was before.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -24,7 +24,7 @@ pub struct SceneFile {
     pub indices: Vec<SceneIndex>,
     /// Whether measured positions place each component in the frame of `origin`; if not, its frame is its own.
     pub placed: Vec<bool>,
-    /// Images of each component about which it may be folded; ascending.
+    /// Images of each component about which it may be wrong; ascending.
     pub doubtful: Vec<Vec<ImageId>>,
     /// What each component may be off, where that is told.
     pub errors: Vec<Option<ModelErrors>>,

@@ -7,6 +7,7 @@
 
 mod alignment;
 pub mod bundle;
+mod direction;
 mod geometry;
 mod georegister;
 mod ground;
@@ -19,6 +20,7 @@ pub mod solvers;
 mod surfaces;
 pub mod synthetic;
 mod two_view;
+mod unconfirmed;
 mod visibility;
 mod walls;
 
@@ -41,4 +43,5 @@ pub use reconstruction::{
 };
 pub use surfaces::{Likeness, PlacedPhoto, SurfacePlace, likeness_of, places_on_surfaces};
 pub use two_view::{PairGeometry, TWO_VIEW_VERSION, TwoView, TwoViewKind, TwoViewParams, verify_pair};
+pub use unconfirmed::UnconfirmedPair;
 pub use walls::{DistantPhoto, ScaleByWalls, WallSight, scale_by_walls};

@@ -7,7 +7,6 @@ pub(crate) mod continuation;
 mod corner;
 mod correspondence;
 mod depths;
-mod direction;
 mod divide;
 mod initial;
 mod input;

@@ -1,7 +1,7 @@
 //! What is said of the models of a scene when it is built.
 
 use setloc_index::SceneIndex;
-use setloc_sfm::{ImageId, ModelErrors, Reconstruction};
+use setloc_sfm::{ImageId, ModelErrors, Reconstruction, UnconfirmedPair};
 
 use super::accuracy::first_of;
 
@@ -53,9 +53,17 @@ pub(super) fn shared_errors_note((component, errors): (usize, &Option<ModelError
     })
 }
 
-/// Says what images about which a model may be folded mean for photos.
+/// Says what images about which a model may be wrong mean for photos.
 pub(super) fn doubt(component: &Reconstruction, images: &[ImageId]) -> Option<String> {
     let names: Vec<&str> = images.iter().map(|image| component.images[image.index()].name.as_str()).collect();
+    if let Some(pair) = UnconfirmedPair::of(component) {
+        return Some(format!(
+            "photos of what {} show will be uncertain: {} points in few directions hold these two images together, and no \
+             third confirms it (a poster may hang twice, floors may look alike)",
+            names.join(" and "),
+            pair.points
+        ));
+    }
     (!names.is_empty()).then(|| {
         format!("photos of what {} show will be uncertain: the model may be folded there", names.join(", "))
     })

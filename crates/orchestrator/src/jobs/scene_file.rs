@@ -7,7 +7,8 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 use setloc_features::{ImageFeatures, Wgs84};
 use setloc_sfm::{
-    ImageId, MapperOutput, MeasuredPosition, MergeRecord, ModelErrors, Reconstruction, doubtful_images,
+    ImageId, MapperOutput, MeasuredPosition, MergeRecord, ModelErrors, Reconstruction, UnconfirmedPair,
+    doubtful_images,
 };
 
 use super::accuracy::Accuracy;
@@ -61,7 +62,10 @@ impl SceneRecipe {
         let origin =
             origin.map(|at| if self.has_altitudes() { at } else { Wgs84 { alt: NO_ALTITUDE, ..at } });
         let doubtful: Vec<Vec<ImageId>> = (output.components.iter().zip(&output.outvoted))
-            .map(|(component, outvoted)| doubtful_images(component, outvoted))
+            .map(|(component, outvoted)| match UnconfirmedPair::of(component) {
+                Some(pair) => vec![pair.first, pair.second],
+                None => doubtful_images(component, outvoted),
+            })
             .collect();
         let errors: Vec<Option<ModelErrors>> = (output.components.iter())
             .zip(&output.report.georegistrations)

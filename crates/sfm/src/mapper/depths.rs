@@ -17,7 +17,6 @@ use setloc_features::{Match, Rays};
 
 use super::{
     continuation::{depth_sigma, known_points, of_unknown_direction, reference_of},
-    direction,
     merge::median,
     model::Model,
     plane::SeenPoint,
@@ -25,7 +24,7 @@ use super::{
     votes::{LEAD, Opinion, peaks},
 };
 use crate::{
-    BaselineLength, ImageId, Rigid, StepPose,
+    BaselineLength, ImageId, Rigid, StepPose, direction,
     solvers::triangulation::{WorldRay, triangulate},
 };
 

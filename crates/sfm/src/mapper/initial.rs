@@ -2,8 +2,8 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use setloc_features::Match;
 
-use super::{MapperParams, correspondence::CorrespondenceGraph, direction, model::Model};
-use crate::{PairGeometry, TwoViewKind};
+use super::{MapperParams, correspondence::CorrespondenceGraph, model::Model};
+use crate::{PairGeometry, TwoViewKind, direction};
 
 /// Verified pairs worth starting from, best first, as indices into the input's pairs.
 ///

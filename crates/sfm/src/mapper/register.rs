@@ -1,9 +1,9 @@
 use nalgebra::Vector3;
 use setloc_features::{GuidedParams, match_guided_among};
 
-use super::{correspondence::CorrespondenceGraph, direction, model::Model};
+use super::{correspondence::CorrespondenceGraph, model::Model};
 use crate::{
-    BaselineLength, ImageId, Observation, PointId, Rigid, TwoViewKind,
+    BaselineLength, ImageId, Observation, PointId, Rigid, TwoViewKind, direction,
     robust::{RansacParams, estimate_absolute_pose, refine_absolute_pose},
     solvers::{essential::essential_from_pose, triangulation::length_along},
     visibility::{is_in_image, is_same_view},

@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 use nalgebra::{UnitQuaternion, Vector3};
 use setloc_features::{Match, Rays};
 
-use super::direction;
+use crate::direction;
 
 /// The cells of the half of the sphere about each cell.
 static HALVES: LazyLock<Vec<Vec<usize>>> = LazyLock::new(|| {

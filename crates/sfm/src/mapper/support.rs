@@ -8,8 +8,8 @@ use std::{cmp::Reverse, collections::BTreeMap};
 
 use setloc_features::Match;
 
-use super::{direction, model::Model, witnesses::count_agreeing};
-use crate::{ImageId, PairGeometry, Rigid};
+use super::{model::Model, witnesses::count_agreeing};
+use crate::{ImageId, PairGeometry, Rigid, direction};
 
 /// Share of a pair's verified matches on the epipolar circles of a pose from which the pair is for that pose.
 const MIN_FOR: f64 = 0.8;

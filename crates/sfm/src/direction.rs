@@ -1,12 +1,14 @@
+//! Directions in cells of equal kind all over the sphere.
+
 use nalgebra::Vector3;
 
 /// Cells along each side of a cube's face.
 const SIDE: usize = 4;
 /// Number of cells on the sphere: the faces of a cube, cut into squares.
-pub(super) const CELLS: usize = 6 * SIDE * SIDE;
+pub(crate) const CELLS: usize = 6 * SIDE * SIDE;
 
 /// The cell that a direction of any length falls into; `None` for the zero vector.
-pub(super) fn cell(direction: &Vector3<f64>) -> Option<usize> {
+pub(crate) fn cell(direction: &Vector3<f64>) -> Option<usize> {
     let axis = direction.iamax();
     let largest = direction[axis].abs();
     if !(largest > 0.0) {
@@ -21,7 +23,7 @@ pub(super) fn cell(direction: &Vector3<f64>) -> Option<usize> {
 const MAX_IN_CELL: usize = 5;
 
 /// How many these directions are, of each cell up to five: a façade that repeats itself has hundreds in a few.
-pub(super) fn spread<'d>(directions: impl Iterator<Item = &'d Vector3<f64>>) -> usize {
+pub(crate) fn spread<'d>(directions: impl Iterator<Item = &'d Vector3<f64>>) -> usize {
     let mut cells = [0; CELLS];
     for cell in directions.filter_map(cell) {
         cells[cell] = MAX_IN_CELL.min(cells[cell] + 1);
@@ -30,7 +32,7 @@ pub(super) fn spread<'d>(directions: impl Iterator<Item = &'d Vector3<f64>>) -> 
 }
 
 /// The unit vector through the middle of a cell.
-pub(super) fn centre(cell: usize) -> Vector3<f64> {
+pub(crate) fn centre(cell: usize) -> Vector3<f64> {
     let (face, row, column) = (cell / (SIDE * SIDE), cell / SIDE % SIDE, cell % SIDE);
     let axis = face / 2;
     let along = |step: usize| (step as f64 + 0.5) / SIDE as f64 * 2.0 - 1.0;
