@@ -86,24 +86,50 @@ pub fn build_scene(
     let (calibrated, first) = estimate_cameras(session, name, given)?;
     let images = calibrated.as_deref().unwrap_or(&folder.images);
     let mut passes = Passes { session, source, alike: &alike, run: before.and(first), export };
-    let mut pass = passes.pass(images, |left| !config.looks_again(left))?;
-    if let Pass::Left(first, again) = &pass {
-        session.note(format!(
-            "{} of {} images are apart from the largest component and looked at once more (second_look)",
-            first.images.len(),
-            images.len()
-        ));
-        pass = passes.pass(again, |second| second.tells_more_than(first))?;
-    }
-    if let Pass::Left(..) = pass {
-        session.note("no more images came together by that, and the first model stays".to_owned());
-        // All of it is stored.
-        pass = passes.pass(images, |_| true)?;
-    }
+    let outcome =
+        by_passes(config, images, |text| session.note(text), |images, stays| passes.pass(images, stays))?;
     session.remember(name, &passes.run);
-    match pass {
-        Pass::Done(outcome) => outcome,
-        Pass::Left(..) => anyhow::bail!("the last pass did not stay: this is a bug"),
+    outcome
+}
+
+/// Whether a pass stays, by what its model leaves apart.
+type Stays<'a> = dyn Fn(&LeftApart) -> bool + Send + Sync + 'a;
+
+/// What a pass over the images of a scene came to.
+pub enum Pass<T> {
+    /// It stays, with this.
+    Stays(T),
+    /// What its model leaves apart, which rules it out, and the images for another pass.
+    Leaves(LeftApart, Vec<SourceImage>),
+}
+
+/// What the pass that stays comes to: the first; where its model is torn that with a second look, if it tells more.
+///
+/// # Errors
+/// As `pass` does.
+pub fn by_passes<T>(
+    config: &Config,
+    images: &[SourceImage],
+    note: impl Fn(String),
+    mut pass: impl FnMut(&[SourceImage], &Stays<'_>) -> Result<Pass<T>>,
+) -> Result<T> {
+    let (first, again) = match pass(images, &|left| !config.looks_again(left))? {
+        Pass::Stays(made) => return Ok(made),
+        Pass::Leaves(first, again) => (first, again),
+    };
+    note(format!(
+        "{} of {} images are apart from the largest component and looked at once more (second_look)",
+        first.images.len(),
+        images.len()
+    ));
+    if let Pass::Stays(made) = pass(&again, &|second| second.tells_more_than(&first))? {
+        return Ok(made);
+    }
+    note("no more images came together by that, and the first model stays".to_owned());
+    // All of it is stored.
+    match pass(images, &|_| true)? {
+        Pass::Stays(made) => Ok(made),
+        Pass::Leaves(..) => anyhow::bail!("the last pass did not stay: this is a bug"),
     }
 }
 
@@ -118,21 +144,9 @@ struct Passes<'a, Export> {
     export: Export,
 }
 
-/// What a pass came to.
-enum Pass {
-    /// Its scene stays, if it could be used.
-    Done(Result<BuildOutcome>),
-    /// What its model leaves apart, and the images for another pass.
-    Left(LeftApart, Vec<SourceImage>),
-}
-
 impl<Export: FnMut(&Built) -> Result<()>> Passes<'_, Export> {
     /// Builds a scene of these images, which stays if what its model leaves apart is such.
-    fn pass(
-        &mut self,
-        images: &[SourceImage],
-        stays: impl Fn(&LeftApart) -> bool + Send + Sync,
-    ) -> Result<Pass> {
+    fn pass(&mut self, images: &[SourceImage], stays: &Stays<'_>) -> Result<Pass<Result<BuildOutcome>>> {
         let SceneSource { folder, config, seed, name, present } = self.source;
         let mut graph = JobGraph::default();
         let inputs = SceneInputs { images, alike: self.alike, config, seed };
@@ -140,25 +154,25 @@ impl<Export: FnMut(&Built) -> Result<()>> Passes<'_, Export> {
         graph.want(jobs.scene);
         graph.want_file(jobs.scene);
         graph.want(jobs.apart.job);
-        jobs.finish_only_where(&mut graph, &stays);
+        jobs.finish_only_where(&mut graph, stays);
         jobs.features.iter().for_each(|features| graph.want(*features));
         let (before, export) = (&self.run, &mut self.export);
-        let use_results = |executor: &Executor<'_>, run: &RunResult| -> Result<Pass> {
+        let use_results = |executor: &Executor<'_>, run: &RunResult| -> Result<Pass<Result<BuildOutcome>>> {
             let left = executor.load_made::<LeftApart>(jobs.apart.job)?;
             if let Some(left) = left.filter(|left| !stays(left)) {
                 let again = jobs.apart.looked_at_again(images, &left);
-                return Ok(Pass::Left((*left).clone(), again));
+                return Ok(Pass::Leaves((*left).clone(), again));
             }
             let run = &before.clone().and(run.clone());
             let outcome = outcome_of(executor, &graph, &jobs, folder, run, present)?;
             if let BuildOutcome::Built(built) = &outcome {
                 export(built)?;
             }
-            Ok(Pass::Done(Ok(outcome)))
+            Ok(Pass::Stays(Ok(outcome)))
         };
         let (run, pass) = self.session.run_with(name, &graph, use_results)?;
         self.run.absorb(run);
-        Ok(pass.unwrap_or_else(|error| Pass::Done(Err(error))))
+        Ok(pass.unwrap_or_else(|error| Pass::Stays(Err(error))))
     }
 }
 

@@ -12,8 +12,8 @@ use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
 use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
 use crate::building::{
-    BuildOutcome, Built, SceneSource, alike_pairs, build_scene, estimate_cameras, has_guessed_cameras,
-    left_apart,
+    BuildOutcome, Built, Pass, SceneSource, alike_pairs, build_scene, by_passes, estimate_cameras,
+    has_guessed_cameras, left_apart,
 };
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, unread_images};
@@ -182,27 +182,22 @@ fn next_jobs<'g>(
         told = estimate_cameras(&session()?, name, inputs)?.0;
     }
     let images = told.as_deref().unwrap_or(inputs.images);
-    let apart_where_stored = |images: &[SourceImage]| {
+    let untold = |_| ();
+    by_passes(inputs.config, images, untold, |images, stays| {
+        let inputs = SceneInputs { images, ..inputs };
         let mut graph = JobGraph::default();
-        let apart = add_model_apart(&mut graph, SceneInputs { images, ..inputs })?;
+        let apart = add_model_apart(&mut graph, inputs)?;
         graph.want(apart.job);
-        if !is_stored(&graph, store) {
-            return Ok(None);
+        if is_stored(&graph, store)
+            && let Some((left, again)) = left_apart(&session()?, name, (&graph, &apart), images)?
+            && !stays(&left)
+        {
+            return Ok(Pass::Leaves(left, again));
         }
-        left_apart(&session()?, name, (&graph, &apart), images)
-    };
-    let first = apart_where_stored(images)?.filter(|(first, _)| inputs.config.looks_again(first));
-    let again = match &first {
-        Some((first, again)) => {
-            let second = apart_where_stored(again)?;
-            second.is_none_or(|(second, _)| second.tells_more_than(first)).then_some(again)
-        }
-        None => None,
-    };
-    let mut graph = JobGraph::default();
-    let images = again.map_or(images, Vec::as_slice);
-    add_scene(&mut graph, SceneInputs { images, ..inputs })?;
-    Ok(graph)
+        let mut graph = JobGraph::default();
+        add_scene(&mut graph, inputs)?;
+        Ok(Pass::Stays(graph))
+    })
 }
 
 /// Neither the scene nor what is exported may replace what the scene is made from.
