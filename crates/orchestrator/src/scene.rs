@@ -114,7 +114,7 @@ impl SceneFile {
         poses
     }
 
-    /// Names of the images that no component has a pose of.
+    /// Names of the images that no component has a pose of; ascending.
     pub fn unregistered(&self) -> Vec<&str> {
         let images = self.main().map_or(&[][..], |main| &main.images);
         let is_nowhere = |at: &usize| {
@@ -122,7 +122,10 @@ impl SceneFile {
                 self.components.iter().filter_map(|component| component.images.get(*at)?.world_from_camera);
             poses.count() == 0
         };
-        (0..images.len()).filter(is_nowhere).map(|at| images[at].name.as_str()).collect()
+        let mut names: Vec<&str> =
+            (0..images.len()).filter(is_nowhere).map(|at| images[at].name.as_str()).collect();
+        names.sort_unstable();
+        names
     }
 
     /// The largest component.

@@ -27,6 +27,7 @@ use crate::print;
 use crate::scene::SceneFile;
 use crate::session::{Session, cache_folder};
 use crate::store::{RunRecord, Store, remove_files, write_atomically};
+use crate::text::{MOST_NAMED, listed};
 
 /// Blue, for cameras of the scene.
 pub const SCENE_COLOR: [u8; 3] = [30, 90, 220];
@@ -396,22 +397,12 @@ pub fn summarize(scene: &SceneFile, images: usize) {
     }
     let unregistered = scene.unregistered();
     if !unregistered.is_empty() {
-        print::note(&format!("not registered: {}", listed(&unregistered)));
+        print::note(&format!("not registered: {}", listed(&unregistered, MOST_NAMED)));
     }
     for note in &scene.notes {
         print::note(&format!("note: {note}"));
     }
     warn(&scene.warnings);
-}
-
-/// Most names in a line.
-const MOST_NAMED: usize = 20;
-
-/// Names in a line, and how many more there are.
-pub(super) fn listed(names: &[&str]) -> String {
-    let (named, rest) = names.split_at(names.len().min(MOST_NAMED));
-    let others = if rest.is_empty() { String::new() } else { format!(" and {} others", rest.len()) };
-    format!("{}{others}", named.join(", "))
 }
 
 /// Says which images were left out.
@@ -421,18 +412,5 @@ pub fn warn_skipped(skipped: &[SkippedImage]) {
     }
     if !skipped.is_empty() {
         print::note(&format!("{} images skipped", skipped.len()));
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn long_lists_of_names_are_cut() {
-        let names: Vec<String> = (0..23).map(|number| format!("{number}.jpg")).collect();
-        let names: Vec<&str> = names.iter().map(String::as_str).collect();
-        assert_eq!(listed(&names[..2]), "0.jpg, 1.jpg");
-        assert!(listed(&names).ends_with("18.jpg, 19.jpg and 3 others"));
     }
 }

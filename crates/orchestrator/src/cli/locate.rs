@@ -11,7 +11,7 @@ use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage};
 use super::Answer;
 use super::args::LocateArgs;
 use super::build::{
-    export_folder, listed, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
+    export_folder, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
 };
 use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input, refuse_same_folder};
 use crate::dataset::{
@@ -26,7 +26,7 @@ use crate::print;
 use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::store::write_atomically;
-use crate::text::apart;
+use crate::text::{MOST_NAMED, apart, listed};
 
 /// Red, for the target.
 const TARGET_COLOR: [u8; 3] = [220, 30, 30];
@@ -164,7 +164,7 @@ fn write_grown(
     let apart: Vec<&str> = apart.map(|photo| photo.name.as_str()).collect();
     if !apart.is_empty() {
         let why = "localized in other components than the largest, which alone grows";
-        print::note(&format!("not added: {}: {why}", listed(&apart)));
+        print::note(&format!("not added: {}: {why}", listed(&apart, MOST_NAMED)));
     }
     if let Some(note) = grown.scene.notes.last() {
         print::note(note);

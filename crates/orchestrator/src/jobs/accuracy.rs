@@ -3,6 +3,8 @@
 use nalgebra::Vector3;
 use setloc_sfm::{ImageId, ModelErrors, PoseDeviation, Reconstruction};
 
+use crate::text::listed;
+
 /// Deviation of a centre, as a share of the distance to the nearest other one, from which on it is warned of. Of 33 models of
 /// rendered floors those that were right had at most 0.007, panoramas 0.2–8 m off mostly 0.03 and more.
 const WEAK: f64 = 0.02;
@@ -79,20 +81,10 @@ impl Accuracy {
             format!(
                 "what holds these images is weak or contradicts itself, and they may be misplaced (one sigma, of the distance to \
                  the nearest other): {}",
-                first_of(named.collect(), MAX_NAMED)
+                listed(&named.collect::<Vec<_>>(), MAX_NAMED)
             )
         })
     }
-}
-
-/// The first of some names, with how many more there are.
-pub(super) fn first_of(mut names: Vec<String>, most: usize) -> String {
-    let more = names.len().saturating_sub(most);
-    names.truncate(most);
-    if more > 0 {
-        names.push(format!("and {more} more"));
-    }
-    names.join(", ")
 }
 
 /// Two digits of a length that may have any unit.

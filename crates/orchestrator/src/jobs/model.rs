@@ -22,6 +22,7 @@ use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
 use crate::stages;
+use crate::text::{MOST_NAMED, listed};
 
 /// What the model is for; the name of its job kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -270,8 +271,8 @@ fn apart(
     };
     let name = |image: ImageId| component.images[image.index()].name.as_str();
     let images: Vec<&str> = component.registered().map(name).collect();
-    (at > 0)
-        .then(|| format!("component {} is apart from the largest, {frame}: {}", at + 1, images.join(", ")))
+    let images = listed(&images, MOST_NAMED);
+    (at > 0).then(|| format!("component {} is apart from the largest, {frame}: {images}", at + 1))
 }
 
 /// Stands for an image's name inside models, so that a renamed image leaves them as they are.

@@ -3,7 +3,7 @@
 use setloc_index::SceneIndex;
 use setloc_sfm::{ImageId, ModelErrors, Reconstruction, UnconfirmedPair};
 
-use super::accuracy::first_of;
+use crate::text::listed;
 
 /// Which component a note is of, unless it is the largest.
 fn of_component(component: usize) -> String {
@@ -34,7 +34,7 @@ pub(super) fn lengths_note((component, model): (usize, &Reconstruction), names: 
         "distances{} rest on what lies beside the points of one pair and on the floor, not on points that a third \
          image sees (± {least:.0} to {most:.0} %): {}",
         of_component(component),
-        first_of(steps, MAX_STEPS_NAMED)
+        listed(&steps, MAX_STEPS_NAMED)
     ))
 }
 
