@@ -6,7 +6,7 @@ use crate::{ImageId, Reconstruction, ReconstructionPoint, direction};
 
 /// Directions in which two panoramas share points, of each cell up to five, below which these may be of two things that look alike. Of
 /// wrong pairs of rendered floors and streets nine tenths have less than 53, the most spread two 82 and 148. Of 16 models of two
-/// panoramas in ten real tours three or four were wrong, at 13 (a poster that hangs twice), 19 (a bathroom of each floor) and 76 (their
+/// panoramas in eight real tours three or four were wrong, at 13 (a poster that hangs twice), 19 (a bathroom of each floor) and 76 (their
 /// corridors); those in the open that are right had 20–154, rooms seen through a door 18–40.
 const MIN_SPREAD: usize = 80;
 
