@@ -11,6 +11,7 @@ mod direction;
 mod geometry;
 mod georegister;
 mod ground;
+mod listing;
 mod mapper;
 mod model_errors;
 mod quality;
@@ -28,6 +29,7 @@ pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, KnownOf
 pub use geometry::{Rigid, Similarity, nearest_rotation};
 pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, MeasuredPositions, georegister};
 pub use ground::{register_by_ground, sharpen_lengths};
+pub use listing::{MOST_NAMED, listed};
 pub use mapper::{
     InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,
     MergeVerdict, Mosaic, PutativePair, Recognition, RegistrationRecord, reconstruct,

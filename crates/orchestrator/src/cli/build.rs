@@ -6,7 +6,7 @@ use anyhow::Result;
 use rayon::prelude::*;
 use serde_json::Value;
 use setloc_features::{Calibration, Camera, ImageFeatures};
-use setloc_sfm::{ImageId, Reconstruction};
+use setloc_sfm::{ImageId, MOST_NAMED, Reconstruction, listed};
 
 use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
@@ -27,7 +27,6 @@ use crate::print;
 use crate::scene::SceneFile;
 use crate::session::{Session, cache_folder};
 use crate::store::{RunRecord, Store, remove_files, write_atomically};
-use crate::text::{MOST_NAMED, listed};
 
 /// Blue, for cameras of the scene.
 pub const SCENE_COLOR: [u8; 3] = [30, 90, 220];

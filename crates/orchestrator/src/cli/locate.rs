@@ -6,7 +6,7 @@ use anyhow::Result;
 use serde_json::json;
 use setloc_camset::{PhotoLocalization, Verdict};
 use setloc_features::Calibration;
-use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage};
+use setloc_sfm::{CameraId, MOST_NAMED, Reconstruction, ReconstructionImage, listed};
 
 use super::Answer;
 use super::args::LocateArgs;
@@ -26,7 +26,7 @@ use crate::print;
 use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::store::write_atomically;
-use crate::text::{MOST_NAMED, apart, listed};
+use crate::text::apart;
 
 /// Red, for the target.
 const TARGET_COLOR: [u8; 3] = [220, 30, 30];

@@ -1,9 +1,7 @@
 //! How well the poses of a model are known, in words.
 
 use nalgebra::Vector3;
-use setloc_sfm::{ImageId, ModelErrors, PoseDeviation, Reconstruction};
-
-use crate::text::listed;
+use setloc_sfm::{ImageId, ModelErrors, PoseDeviation, Reconstruction, listed};
 
 /// Deviation of a centre, as a share of the distance to the nearest other one, from which on it is warned of. Of 33 models of
 /// rendered floors those that were right had at most 0.007, panoramas 0.2–8 m off mostly 0.03 and more.

@@ -12,7 +12,7 @@ use setloc_sfm::{
     sharpen_lengths,
 };
 
-use super::features::{features_role, read_unchanged};
+use super::features::{accept_features, features_role, read_unchanged};
 use super::model::image_of_place_holder;
 use super::positions::Measurements;
 use crate::dataset::SourceImage;
@@ -64,9 +64,7 @@ pub(super) fn add_alignment(
         work: Box::new(work),
     });
     graph.require(aligned, "model", model);
-    for (at, used) in features.iter().enumerate() {
-        graph.accept(aligned, features_role(at), *used);
-    }
+    accept_features(graph, aligned, features);
     aligned
 }
 

@@ -56,6 +56,13 @@ pub(super) fn features_role(at: usize) -> String {
     format!("features {at:04}")
 }
 
+/// Lets a job use the features of images, of those that have any.
+pub(super) fn accept_features(graph: &mut JobGraph<'_>, job: JobId, features: &[JobId]) {
+    for (at, used) in features.iter().enumerate() {
+        graph.accept(job, features_role(at), *used);
+    }
+}
+
 /// Adds decoding and extraction of an image, `beside` a job that has extracted all but simulated views.
 fn add_features(
     graph: &mut JobGraph<'_>,

@@ -8,7 +8,7 @@ use setloc_features::ImageFeatures;
 use setloc_index::IndexParams;
 use setloc_sfm::MapperOutput;
 
-use super::features::features_role;
+use super::features::{accept_features, features_role};
 use super::locate::{EmptyScene, LocateJobs, SetJobs, SingleJobs, alone_of, main_of, query};
 use super::scene_file::KEPT_FEATURES;
 use crate::codec::{self, Artifact};
@@ -78,10 +78,10 @@ pub fn add_grown(
         work: Box::new(move |inputs| Product::new(grown_scene(inputs, &owned, &names, &scene, &index)?)),
     });
     graph.require(grown, "growth", growth);
-    for (at, (features, single)) in located.features.iter().zip(&located.single).enumerate() {
-        graph.accept(growth, features_role(at), *features);
+    accept_features(graph, growth, &located.features);
+    accept_features(graph, grown, &located.features);
+    for (at, single) in located.single.iter().enumerate() {
         single.accepted_by(graph, growth, at);
-        graph.accept(grown, features_role(at), *features);
     }
     Ok(grown)
 }

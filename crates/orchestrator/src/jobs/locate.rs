@@ -11,7 +11,7 @@ use setloc_features::{Camera, ImageFeatures};
 use setloc_index::SceneIndex;
 use setloc_sfm::{ImageId, MapperOutput, Reconstruction};
 
-use super::features::features_role;
+use super::features::{accept_features, features_role};
 use super::model::{ModelJobs, ModelKind, ModelSource, add_model};
 use super::pixels::PicturesAtHand;
 use super::{choose_pairs, derived_seed};
@@ -90,8 +90,8 @@ pub fn add_set(
         work: Box::new(work),
     });
     graph.require(set, "local_model", model.model);
-    for (at, (features, single)) in model.features.iter().zip(&single).enumerate() {
-        graph.accept(set, features_role(at), *features);
+    accept_features(graph, set, &model.features);
+    for (at, single) in single.iter().enumerate() {
         single.accepted_by(graph, set, at);
     }
     Ok(SetJobs { model, single, set })

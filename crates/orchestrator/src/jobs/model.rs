@@ -7,13 +7,13 @@ use anyhow::Result;
 use serde_json::json;
 use setloc_features::{Calibration, Camera, ImageFeatures, Match};
 use setloc_sfm::{
-    CameraId, Georegistration, ImageId, InputImage, MapperInput, MapperOutput, MapperParams,
+    CameraId, Georegistration, ImageId, InputImage, MOST_NAMED, MapperInput, MapperOutput, MapperParams,
     MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction, TwoViewParams, assess,
-    reconstruct,
+    listed, reconstruct,
 };
 
 use super::alignment::{KnownOfModel, add_alignment};
-use super::features::{Looks, add_features_of, features_role};
+use super::features::{Looks, accept_features, add_features_of, features_role};
 use super::matching::{PairSource, add_pair, is_swapped};
 use super::positions::Measurements;
 use crate::artifacts::{PairMatches, VerifiedPair};
@@ -22,7 +22,6 @@ use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
 use crate::stages;
-use crate::text::{MOST_NAMED, listed};
 
 /// What the model is for; the name of its job kind.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -114,9 +113,7 @@ pub fn add_model(
         memory: 64 << 20,
         work: Box::new(work),
     });
-    for (at, used) in features.iter().enumerate() {
-        graph.accept(mapped, features_role(at), *used);
-    }
+    accept_features(graph, mapped, &features);
     for (a, b, used) in pairs {
         graph.accept(mapped, pair_role(a, b), used.verified);
         graph.accept(mapped, matches_role(a, b), used.matches);

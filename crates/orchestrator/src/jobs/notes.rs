@@ -1,9 +1,9 @@
 //! What is said of the models of a scene when it is built.
 
 use setloc_index::SceneIndex;
-use setloc_sfm::{ImageId, ModelErrors, Reconstruction, UnconfirmedPair};
-
-use crate::text::listed;
+use setloc_sfm::{
+    ImageId, ModelErrors, OutvotedPair, Reconstruction, UnconfirmedPair, doubtful_images, listed,
+};
 
 /// Which component a note is of, unless it is the largest.
 fn of_component(component: usize) -> String {
@@ -53,20 +53,48 @@ pub(super) fn shared_errors_note((component, errors): (usize, &Option<ModelError
     })
 }
 
-/// Says what images about which a model may be wrong mean for photos.
-pub(super) fn doubt(component: &Reconstruction, images: &[ImageId]) -> Option<String> {
-    let names: Vec<&str> = images.iter().map(|image| component.images[image.index()].name.as_str()).collect();
-    if let Some(pair) = UnconfirmedPair::of(component) {
-        return Some(format!(
-            "photos of what {} show will be uncertain: {} points in few directions hold these two images together, and no \
-             third confirms it (a poster may hang twice, floors may look alike)",
-            names.join(" and "),
-            pair.points
-        ));
+/// Why a model may be wrong, and where.
+pub(super) enum Doubt {
+    /// About these images it may be folded; none where nothing says so.
+    Folded(Vec<ImageId>),
+    /// Nothing but these two images tells it.
+    Unconfirmed(UnconfirmedPair),
+}
+
+impl Doubt {
+    /// Of a component with the pairs that outvote it.
+    pub fn of(component: &Reconstruction, outvoted: &[OutvotedPair]) -> Self {
+        match UnconfirmedPair::of(component) {
+            Some(pair) => Self::Unconfirmed(pair),
+            None => Self::Folded(doubtful_images(component, outvoted)),
+        }
     }
-    (!names.is_empty()).then(|| {
-        format!("photos of what {} show will be uncertain: the model may be folded there", names.join(", "))
-    })
+
+    /// The images about which it may be wrong; ascending.
+    pub fn images(&self) -> Vec<ImageId> {
+        match self {
+            Self::Folded(images) => images.clone(),
+            Self::Unconfirmed(pair) => vec![pair.first, pair.second],
+        }
+    }
+
+    /// Says what that means for photos.
+    pub fn warning(&self, component: &Reconstruction) -> Option<String> {
+        let name = |image: ImageId| component.images[image.index()].name.as_str();
+        match self {
+            Self::Folded(images) => (!images.is_empty()).then(|| {
+                let names: Vec<&str> = images.iter().map(|image| name(*image)).collect();
+                let names = names.join(", ");
+                format!("photos of what {names} show will be uncertain: the model may be folded there")
+            }),
+            Self::Unconfirmed(UnconfirmedPair { first, second, points }) => Some(format!(
+                "photos of what {} and {} show will be uncertain: {points} points in few directions hold these two images \
+                 together, and no third confirms it (a poster may hang twice, floors may look alike)",
+                name(*first),
+                name(*second)
+            )),
+        }
+    }
 }
 
 /// Share of the nearest scene points below which an index is said to miss too many.

@@ -7,7 +7,7 @@ use setloc_index::SceneIndex;
 use setloc_sfm::{MapperOutput, MeasuredPosition, ReconstructionImage};
 
 use super::choose_pairs;
-use super::features::features_role;
+use super::features::{accept_features, features_role};
 use super::model::{ModelJobs, ModelKind, ModelSource, add_model, image_of_place_holder};
 use super::scene_file::SceneRecipe;
 use crate::artifacts::{LeftApart, SceneIndices};
@@ -228,9 +228,7 @@ fn add_index(graph: &mut JobGraph<'_>, config: &Config, jobs: &ModelJobs) -> Res
         work: Box::new(work),
     });
     graph.require(index, "model", jobs.model);
-    for (at, features) in jobs.features.iter().enumerate() {
-        graph.accept(index, features_role(at), *features);
-    }
+    accept_features(graph, index, &jobs.features);
     Ok(index)
 }
 
@@ -248,9 +246,7 @@ fn add_scene_file(graph: &mut JobGraph<'_>, recipe: SceneRecipe, jobs: &ModelJob
     });
     graph.require(scene, "model", jobs.model);
     graph.require(scene, "index", index);
-    for (at, features) in jobs.features.iter().enumerate() {
-        graph.accept(scene, features_role(at), *features);
-    }
+    accept_features(graph, scene, &jobs.features);
     scene
 }
 

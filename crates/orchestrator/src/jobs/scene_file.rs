@@ -6,15 +6,12 @@ use anyhow::Result;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use setloc_features::{ImageFeatures, Wgs84};
-use setloc_sfm::{
-    ImageId, MapperOutput, MeasuredPosition, MergeRecord, ModelErrors, Reconstruction, UnconfirmedPair,
-    doubtful_images,
-};
+use setloc_sfm::{ImageId, MapperOutput, MeasuredPosition, MergeRecord, ModelErrors, Reconstruction};
 
 use super::accuracy::Accuracy;
 use super::features::features_role;
 use super::model::{image_of_place_holder, with_names};
-use super::notes::{Recall, doubt, lengths_note, shared_errors_note, stretch_note, worst_recall};
+use super::notes::{Doubt, Recall, lengths_note, shared_errors_note, stretch_note, worst_recall};
 use super::positions::{self, Fix, Measurements};
 use crate::artifacts::SceneIndices;
 use crate::codec::Artifact;
@@ -61,11 +58,8 @@ impl SceneRecipe {
         let origin = self.origin.filter(|_| placed.first() == Some(&true));
         let origin =
             origin.map(|at| if self.has_altitudes() { at } else { Wgs84 { alt: NO_ALTITUDE, ..at } });
-        let doubtful: Vec<Vec<ImageId>> = (output.components.iter().zip(&output.outvoted))
-            .map(|(component, outvoted)| match UnconfirmedPair::of(component) {
-                Some(pair) => vec![pair.first, pair.second],
-                None => doubtful_images(component, outvoted),
-            })
+        let doubts: Vec<Doubt> = (output.components.iter().zip(&output.outvoted))
+            .map(|(component, outvoted)| Doubt::of(component, outvoted))
             .collect();
         let errors: Vec<Option<ModelErrors>> = (output.components.iter())
             .zip(&output.report.georegistrations)
@@ -81,7 +75,7 @@ impl SceneRecipe {
             features: features?,
             config: self.config.clone(),
             components,
-            doubtful,
+            doubtful: doubts.iter().map(Doubt::images).collect(),
             errors,
             origin,
             warnings: Vec::new(),
@@ -89,7 +83,7 @@ impl SceneRecipe {
             grown: Vec::new(),
             grown_from: Vec::new(),
         };
-        (scene.warnings, scene.notes) = self.said_of(&output, &scene);
+        (scene.warnings, scene.notes) = self.said_of(&output, &doubts, &scene);
         Ok(scene)
     }
 
@@ -99,7 +93,12 @@ impl SceneRecipe {
     }
 
     /// Warnings and notes about a scene of this model.
-    fn said_of(&self, output: &MapperOutput, scene: &SceneFile) -> (Vec<String>, Vec<String>) {
+    fn said_of(
+        &self,
+        output: &MapperOutput,
+        doubts: &[Doubt],
+        scene: &SceneFile,
+    ) -> (Vec<String>, Vec<String>) {
         let Self { names, measured, .. } = self;
         let models = || output.components.iter().enumerate();
         let contradicted = (output.components.iter())
@@ -116,10 +115,10 @@ impl SceneRecipe {
         });
         let fixes = fixes_of(output, &measured.positions);
         let recall = worst_recall(&scene.indices);
-        let doubts = scene.components.iter().zip(&scene.doubtful);
+        let doubts = scene.components.iter().zip(doubts);
         let warnings = warnings
             .map(|text| with_names(&text, names))
-            .chain(doubts.filter_map(|(component, images)| doubt(component, images)))
+            .chain(doubts.filter_map(|(component, doubt)| doubt.warning(component)))
             .chain(accuracies.iter().flatten().filter_map(|accuracy| accuracy.warning(names)))
             .chain(recall.as_ref().and_then(Recall::warning))
             .chain(fixes.as_deref().and_then(positions::warning));

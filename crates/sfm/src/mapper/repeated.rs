@@ -9,10 +9,8 @@ use setloc_features::{Match, Posture, Rays};
 use super::sides::{compare, count_matches, count_shareable, sees_all_around};
 use super::witnesses::{Witnesses, count_on_circles};
 use super::{InputImage, MapperInput, Part, PutativePair};
-use crate::{ImageId, PairGeometry, Reconstruction, Rigid, TwoViewKind, verify_pair};
+use crate::{ImageId, MOST_NAMED, PairGeometry, Reconstruction, Rigid, TwoViewKind, listed, verify_pair};
 
-/// Most images that a warning names.
-const MOST_NAMED: usize = 20;
 /// Share of all verified matches that must lie in one-sided geometries for a model to be judged by the rest. Rendered
 /// rooms with floors of exactly repeated tiles or planks have 0.12 to 0.78, two with other floors 0.03 and 0.05, rendered
 /// streets up to 0.16, real ones 0.22 (trees that match nowhere) and 0.27 (a rider moves with the camera), towns nothing.
@@ -174,12 +172,10 @@ impl<'a> Underfoot<'a> {
         if held.is_empty() {
             return None;
         }
-        let named = held.iter().take(MOST_NAMED).map(|image| self.input.images[image.index()].name);
-        let others = held.len().saturating_sub(MOST_NAMED);
-        let others = if others > 0 { format!(" and {others} others") } else { String::new() };
+        let names: Vec<&str> = held.iter().map(|image| self.input.images[image.index()].name).collect();
         let warning = format!(
-            "the floor repeats itself, and nothing else held {}{others}: what lies underfoot counts there only where the rest agrees",
-            named.collect::<Vec<&str>>().join(", ")
+            "the floor repeats itself, and nothing else held {}: what lies underfoot counts there only where the rest agrees",
+            listed(&names, MOST_NAMED)
         );
         Some((self.left_out(&self.downs, |image| held.contains(&image), seed), warning))
     }
