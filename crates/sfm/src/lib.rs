@@ -37,7 +37,7 @@ pub use mapper::{
 pub use model_errors::{BearingField, ModelErrors, PoseDeviation};
 pub use quality::{
     OutvotedPair, PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess,
-    doubtful_images,
+    doubtful_images, estranged,
 };
 pub use reconstruction::{
     AlignedTrack, BaselineLength, CameraId, ImageId, Observation, Place, PointId, Reconstruction,

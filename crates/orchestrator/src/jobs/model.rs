@@ -9,7 +9,7 @@ use setloc_features::{Calibration, Camera, ImageFeatures, Match};
 use setloc_sfm::{
     CameraId, Georegistration, ImageId, InputImage, MOST_NAMED, MapperInput, MapperOutput, MapperParams,
     MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction, TwoViewParams, assess,
-    listed, reconstruct,
+    estranged, listed, reconstruct,
 };
 
 use super::alignment::{KnownOfModel, add_alignment};
@@ -244,8 +244,11 @@ fn run_model(
     let contents: Vec<ContentHash> =
         features.iter().map(|(at, _)| inputs.hash(&features_role(*at))).collect::<Result<_>>()?;
     pairs.retain(|pair| contents[pair.first.index()] != contents[pair.second.index()]);
-    for (at, component) in output.components.iter_mut().enumerate() {
-        let report = assess(quality, component, &pairs);
+    let strangers: Vec<_> =
+        (0..output.components.len()).map(|at| estranged(&output.components, at, &pairs)).collect();
+    for ((at, component), strangers) in output.components.iter_mut().enumerate().zip(strangers) {
+        let mut report = assess(quality, component, &pairs);
+        report.outvoted.extend(strangers);
         output.report.warnings.extend(report.sentences(component));
         output.outvoted.push(report.outvoted);
         output.report.georegistrations.push(input.measured.place(component));

@@ -733,7 +733,7 @@ impl<'a> Attempt<'_, '_, 'a> {
             let images = of.component.registered();
             images.filter(|image| !mapper.model.is_registered(*image) && !may_leave(of, *image)).count()
         };
-        self.fit_but_few([self.kept, self.moved].map(num_lost)).then_some(mapper)
+        self.fit_but_few(&mapper.model, [self.kept, self.moved].map(num_lost)).then_some(mapper)
     }
 
     /// The model of both, that images may join but those that are taken.
@@ -750,10 +750,19 @@ impl<'a> Attempt<'_, '_, 'a> {
         mapper
     }
 
-    /// Whether so few images of the kept and the moved part do not fit the whole that it may be their own fault.
-    fn fit_but_few(&self, num_unfit: [usize; 2]) -> bool {
-        let parts = [self.kept, self.moved];
-        parts.into_iter().zip(num_unfit).all(|(part, unfit)| unfit * UNFIT_ONE_IN <= part.size())
+    /// Whether so few images of the kept and the moved part do not fit the whole that it says nothing against it.
+    fn fit_but_few(&self, model: &Model<'_>, num_unfit: [usize; 2]) -> bool {
+        let parts = || [self.kept, self.moved].into_iter().zip(num_unfit);
+        let are_few = |is_beyond_doubt| {
+            parts().all(|(part, num_unfit)| may_be_unfit(num_unfit, part.size(), is_beyond_doubt))
+        };
+        are_few(false) || are_few(true) && self.is_beyond_doubt(model)
+    }
+
+    /// Whether the pairs of panoramas across bear out the adjusted whole, one of them all round, and none speaks against it.
+    fn is_beyond_doubt(&self, model: &Model<'_>) -> bool {
+        let support = self.support_across(model);
+        support.is_clear() && support.against == 0 && support.is_strong()
     }
 
     /// Whether all images of both are in the whole.
@@ -799,16 +808,26 @@ impl<'a> Attempt<'_, '_, 'a> {
         self.keeps_points(model)
             && ties >= self.params.min_registration_inliers
             && !self.is_contradicted(model)
-            && self.fit_but_few(sides.map(|side| mapper.misplaced_count(side.registered())))
+            && self.fit_but_few(model, sides.map(|side| mapper.misplaced_count(side.registered())))
             && (recognized() || self.is_strong(ties, hypothesis) || self.share_as_neighbours(pose))
     }
 
     /// Whether a verified pair of panoramas across speaks against the adjusted whole by far more than speaks for it.
     fn is_contradicted(&self, model: &Model<'_>) -> bool {
-        let is_moved = |image: ImageId| self.sides.moved.is_registered(image);
         model.registered().all(|image| model.input.is_panoramic(image))
-            && Support::across(model, is_moved, self.params.max_error_sigma).is_untenable()
+            && self.support_across(model).is_untenable()
     }
+
+    /// What the verified pairs between the two say of the whole.
+    fn support_across(&self, model: &Model<'_>) -> Support {
+        Support::across(model, |image| self.sides.moved.is_registered(image), self.params.max_error_sigma)
+    }
+}
+
+/// Whether so many images of a part may not fit the whole: each may have come in wrongly, or what the other part's images see may be
+/// hidden from it (an upper floor's see the rooms below), which half of them may be where pairs leave no doubt about the place.
+fn may_be_unfit(num_unfit: usize, of: usize, is_beyond_doubt: bool) -> bool {
+    num_unfit * UNFIT_ONE_IN <= of || is_beyond_doubt && 2 * num_unfit < of
 }
 
 /// Whether so many matches agree, of those expected by likeness, that what is missing is hidden.
@@ -826,6 +845,13 @@ pub(crate) fn median(mut values: Vec<f64>) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// One of four images of a house stands on the upper floor.
+    #[test]
+    fn more_images_may_be_unfit_where_pairs_leave_no_doubt() {
+        assert!(may_be_unfit(0, 2, false) && may_be_unfit(1, 8, false) && !may_be_unfit(1, 4, false));
+        assert!(may_be_unfit(1, 4, true) && !may_be_unfit(2, 4, true) && !may_be_unfit(1, 2, true));
+    }
 
     /// Figures of parts of a church, a street and rendered streets, in their places and in wrong ones.
     #[test]
