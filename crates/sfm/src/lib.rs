@@ -8,6 +8,7 @@
 mod alignment;
 pub mod bundle;
 mod direction;
+mod estranged;
 mod geometry;
 mod georegister;
 mod ground;
@@ -26,6 +27,7 @@ mod visibility;
 mod walls;
 
 pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, KnownOfComponent, align_tracks};
+pub use estranged::estranged;
 pub use geometry::{Rigid, Similarity, nearest_rotation};
 pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, MeasuredPositions, georegister};
 pub use ground::{register_by_ground, sharpen_lengths};
@@ -37,7 +39,7 @@ pub use mapper::{
 pub use model_errors::{BearingField, ModelErrors, PoseDeviation};
 pub use quality::{
     OutvotedPair, PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess,
-    doubtful_images, estranged,
+    doubtful_images,
 };
 pub use reconstruction::{
     AlignedTrack, BaselineLength, CameraId, ImageId, Observation, Place, PointId, Reconstruction,
