@@ -3,8 +3,6 @@
 //! What a large component refuses, by what walls hide from it, makes components of its own, and of the pairs that are left there more are
 //! wrong than elsewhere: the right ones are with the images that are gone.
 
-use std::collections::{BTreeMap, BTreeSet};
-
 use crate::{ImageId, OutvotedPair, PairGeometry, Reconstruction, TwoViewKind, quality::HEAVY_MATCHES};
 
 /// Matches of a pair with an image of a larger component for each point of the strongest link within an image's own from which on it
@@ -12,32 +10,24 @@ use crate::{ImageId, OutvotedPair, PairGeometry, Reconstruction, TwoViewKind, qu
 /// part of their own (336 matches with a corridor's, 78 points within); of a right part of a real house 99 and 56.
 const MIN_WEIGHT: f64 = 2.0;
 
-/// The panoramas of a component, the largest of which come first, that share by far more with an image of a larger one than anything
-/// holds them where they are; each with that pair.
-pub fn estranged(components: &[Reconstruction], at: usize, pairs: &[PairGeometry]) -> Vec<OutvotedPair> {
-    if at == 0 {
-        return Vec::new();
-    }
-    let component = &components[at];
+/// The panoramas of a component that share by far more with an image of a larger one than points with any of their own; each with
+/// that pair.
+pub(crate) fn estranged(
+    component: &Reconstruction,
+    larger: &[Reconstruction],
+    pairs: &[PairGeometry],
+    shared_points: impl Fn(ImageId, ImageId) -> usize,
+) -> Vec<OutvotedPair> {
     let is_in = |of: &Reconstruction, image: ImageId| of.images[image.index()].world_from_camera.is_some();
-    let mut links: BTreeMap<[ImageId; 2], usize> = BTreeMap::new();
-    for point in &component.points {
-        let seen: BTreeSet<ImageId> = point.track.iter().map(|seen| seen.image).collect();
-        for &first in &seen {
-            for &second in seen.iter().filter(|&&second| second != first) {
-                *links.entry([first, second]).or_default() += 1;
-            }
-        }
-    }
     let estranged = |image: ImageId| {
         let strongest = (pairs.iter())
             .filter(|pair| pair.two_view.kind == TwoViewKind::General)
             .filter_map(|pair| Some((pair.two_view.inliers.len(), pair.seen_from(image)?.0)))
-            .filter(|(_, other)| components[..at].iter().any(|larger| is_in(larger, *other)))
+            .filter(|(_, other)| larger.iter().any(|larger| is_in(larger, *other)))
             .max_by_key(|&(matches, other)| (matches, std::cmp::Reverse(other)))?;
         let (matches, second) = strongest;
-        let of_image = links.range([image, ImageId(0)]..=[image, ImageId(u32::MAX)]);
-        let held_by = of_image.map(|(_, points)| *points).max().unwrap_or(0);
+        let others = component.registered().filter(|&other| other != image);
+        let held_by = others.map(|other| shared_points(image, other)).max().unwrap_or(0);
         let pair = OutvotedPair { first: image, second, matches, held_by, side: vec![image] };
         (matches >= HEAVY_MATCHES && pair.weight() >= MIN_WEIGHT).then_some(pair)
     };
@@ -48,12 +38,12 @@ pub fn estranged(components: &[Reconstruction], at: usize, pairs: &[PairGeometry
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
-    use setloc_features::{Camera, Match};
+    use setloc_features::Camera;
 
     use super::*;
     use crate::{
-        CameraId, Observation, QualityReport, ReconstructionImage, ReconstructionPoint, Rigid, TwoView,
-        doubtful_images,
+        CameraId, Observation, QualityParams, QualityReport, ReconstructionImage, ReconstructionPoint, Rigid,
+        TwoView, assess, doubtful_images,
     };
 
     #[test]
@@ -87,14 +77,11 @@ mod tests {
         let pair = |first: u32, second: u32, matches: u32| PairGeometry {
             first: ImageId(first),
             second: ImageId(second),
-            two_view: TwoView {
-                kind: TwoViewKind::General,
-                second_from_first: Rigid::identity(),
-                inliers: (0..matches).map(|at| Match { first: at, second: at }).collect(),
-                median_parallax_rad: 0.3,
-            },
+            two_view: TwoView::of_equal_features(Rigid::identity(), 0..matches),
         };
-        let found = |at: usize, pairs: &[PairGeometry]| estranged(&components, at, pairs);
+        let found = |at: usize, pairs: &[PairGeometry]| {
+            assess(&QualityParams::default(), &components[at], &components[..at], pairs).outvoted
+        };
         assert_eq!(found(1, &[pair(1, 3, 140), pair(3, 4, 90)]), []);
         let strangers = found(1, &[pair(1, 3, 140), pair(0, 3, 336), pair(3, 4, 90)]);
         let [stranger] = &strangers[..] else { panic!("{strangers:?}") };

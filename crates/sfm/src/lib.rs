@@ -27,7 +27,6 @@ mod visibility;
 mod walls;
 
 pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, KnownOfComponent, align_tracks};
-pub use estranged::estranged;
 pub use geometry::{Rigid, Similarity, nearest_rotation};
 pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, MeasuredPositions, georegister};
 pub use ground::{register_by_ground, sharpen_lengths};

@@ -8,6 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     ImageId, PairGeometry, Reconstruction, ReconstructionImage, ReconstructionPoint, TwoViewKind,
+    estranged::estranged,
+    listed,
     visibility::{is_in_image, is_same_view},
 };
 
@@ -80,7 +82,8 @@ impl PairDisagreement {
 }
 
 /// A verified pair that a model contradicts though it has about as many matches as the model has points where these hold its
-/// two images together: it may well be the model that is wrong there. Or one with an image of a larger model ([`crate::estranged`]).
+/// two images together: it may well be the model that is wrong there. Or one with an image of a larger model, which has far more
+/// matches than its first image has points with any of its own.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct OutvotedPair {
     /// First image.
@@ -169,7 +172,7 @@ pub struct QualityReport {
     pub pairs: usize,
     /// Pairs that the model contradicts; expected where façades repeat, as long as they are few.
     pub disagreements: Vec<PairDisagreement>,
-    /// Those of them that weigh more than what holds the model together there.
+    /// Those of them that weigh more than what holds the model together there, and what its images share with larger models.
     pub outvoted: Vec<OutvotedPair>,
     /// Signs of a fold.
     pub suspicious: Vec<SuspiciousNeighbours>,
@@ -190,10 +193,11 @@ struct Counts {
     points_of: Vec<u32>,
 }
 
-/// Compares a component with the verified pairs it was built from.
+/// Compares a component with the verified pairs that it and the larger ones were built from.
 pub fn assess(
     params: &QualityParams,
     reconstruction: &Reconstruction,
+    larger: &[Reconstruction],
     pairs: &[PairGeometry],
 ) -> QualityReport {
     let n = reconstruction.images.len();
@@ -287,10 +291,13 @@ pub fn assess(
     report.pairs = judged.len();
     let disagreements = judged.into_values().filter(|(_, any_agrees)| !any_agrees);
     report.disagreements = disagreements.map(|(found, _)| found).collect();
-    let links = strongest_links(n, |a, b| shared[a * n + b].max(shared[b * n + a]));
+    let shared_points = |a: usize, b: usize| shared[a * n + b].max(shared[b * n + a]);
+    let links = strongest_links(n, shared_points);
     let spots = Groups::of_one_spot(&reconstruction.images);
     let heavy = report.disagreements.iter().filter(|pair| pair.is_heavy());
     report.outvoted = heavy.filter_map(|pair| outvoted(pair, &spots, &links)).collect();
+    let of_images = |a: ImageId, b: ImageId| shared_points(a.index(), b.index());
+    report.outvoted.extend(estranged(reconstruction, larger, pairs, of_images));
     for first in reconstruction.registered() {
         for second in reconstruction.registered().filter(|&second| second > first) {
             let (forth, back) = (first.index() * n + second.index(), second.index() * n + first.index());
@@ -445,7 +452,6 @@ impl QualityReport {
             worst.sort_by_key(|pair| std::cmp::Reverse(pair.matches));
             let named: Vec<String> = worst
                 .iter()
-                .take(MOST_NAMED)
                 .map(|pair| {
                     let PairDisagreement { matches, used, rotation_deg, .. } = **pair;
                     let how = if pair.is_unused() {
@@ -457,11 +463,10 @@ impl QualityReport {
                 })
                 .collect();
             lines.push(format!(
-                "{} of {} verified pairs contradict the model, as repeated structure does: {}{}",
+                "{} of {} verified pairs contradict the model, as repeated structure does: {}",
                 self.disagreements.len(),
                 self.pairs,
-                named.join(", "),
-                if worst.len() > MOST_NAMED { " and others" } else { "" }
+                listed(&named, MOST_NAMED)
             ));
         }
         lines
@@ -530,13 +535,13 @@ mod tests {
                 covariance: None,
             });
         }
-        let report = assess(&QualityParams::default(), &model, &[]);
+        let report = assess(&QualityParams::default(), &model, &[], &[]);
         assert_eq!(report.suspicious.len(), 1, "{report:?}");
         assert!(report.sentences(&model)[0].starts_with("a and b stand together"));
         // Turned away, neither ought to see what the other does.
         let turned = UnitQuaternion::from_euler_angles(0.0, std::f64::consts::PI, 0.0);
         model.images[1].world_from_camera = Some(Rigid::new(turned, Vector3::new(0.1, 0.0, 0.0)));
-        assert_eq!(assess(&QualityParams::default(), &model, &[]).suspicious, []);
+        assert_eq!(assess(&QualityParams::default(), &model, &[], &[]).suspicious, []);
     }
 
     #[test]
@@ -651,7 +656,7 @@ mod tests {
             let two_view =
                 TwoView { kind, second_from_first: Rigid::identity(), inliers, median_parallax_rad: 0.0 };
             let pair = PairGeometry { first: ImageId(0), second: ImageId(1), two_view };
-            assess(&QualityParams::default(), &model, &[pair])
+            assess(&QualityParams::default(), &model, &[], &[pair])
         };
         let of_turn = report(TwoViewKind::PureRotation);
         assert_eq!((of_turn.disagreements, of_turn.outvoted), (vec![], vec![]));

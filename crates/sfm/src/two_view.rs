@@ -80,6 +80,19 @@ pub struct TwoView {
     pub median_parallax_rad: f64,
 }
 
+#[cfg(test)]
+impl TwoView {
+    /// A geometry whose matches are of features of one number in both images.
+    pub(crate) fn of_equal_features(second_from_first: Rigid, features: impl Iterator<Item = u32>) -> Self {
+        Self {
+            kind: TwoViewKind::General,
+            second_from_first,
+            inliers: features.map(|at| Match { first: at, second: at }).collect(),
+            median_parallax_rad: 0.3,
+        }
+    }
+}
+
 impl TwoView {
     /// The same geometry with the two images exchanged.
     #[must_use]

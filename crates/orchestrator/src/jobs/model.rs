@@ -9,7 +9,7 @@ use setloc_features::{Calibration, Camera, ImageFeatures, Match};
 use setloc_sfm::{
     CameraId, Georegistration, ImageId, InputImage, MOST_NAMED, MapperInput, MapperOutput, MapperParams,
     MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction, TwoViewParams, assess,
-    estranged, listed, reconstruct,
+    listed, reconstruct,
 };
 
 use super::alignment::{KnownOfModel, add_alignment};
@@ -244,11 +244,10 @@ fn run_model(
     let contents: Vec<ContentHash> =
         features.iter().map(|(at, _)| inputs.hash(&features_role(*at))).collect::<Result<_>>()?;
     pairs.retain(|pair| contents[pair.first.index()] != contents[pair.second.index()]);
-    let strangers: Vec<_> =
-        (0..output.components.len()).map(|at| estranged(&output.components, at, &pairs)).collect();
-    for ((at, component), strangers) in output.components.iter_mut().enumerate().zip(strangers) {
-        let mut report = assess(quality, component, &pairs);
-        report.outvoted.extend(strangers);
+    for at in 0..output.components.len() {
+        let (larger, rest) = output.components.split_at_mut(at);
+        let component = &mut rest[0];
+        let report = assess(quality, component, larger, &pairs);
         output.report.warnings.extend(report.sentences(component));
         output.outvoted.push(report.outvoted);
         output.report.georegistrations.push(input.measured.place(component));

@@ -133,11 +133,11 @@ fn cost(model: &Model<'_>, params: &MapperParams, image: ImageId, features: &BTr
 mod tests {
     use nalgebra::{Matrix6, UnitQuaternion, Vector3};
     use rand::Rng;
-    use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
+    use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
 
     use super::*;
     use crate::{
-        BaselineLength, CameraId, InputImage, MapperInput, PairGeometry, TwoView, TwoViewKind, TwoViewParams,
+        BaselineLength, CameraId, InputImage, MapperInput, PairGeometry, TwoView, TwoViewParams,
         synthetic::{normal, rotation_angle, seeded},
     };
 
@@ -185,16 +185,11 @@ mod tests {
         let pair = |first: usize, second: usize| PairGeometry {
             first: ImageId(first as u32),
             second: ImageId(second as u32),
-            two_view: TwoView {
-                kind: TwoViewKind::General,
-                second_from_first: poses[second].inverse() * poses[first],
+            two_view: TwoView::of_equal_features(
+                poses[second].inverse() * poses[first],
                 // The last photo shares half of its matches with one other photo only.
-                inliers: (0..80)
-                    .filter(|at| second < 3 || *at % 2 == 0 || first == (*at / 2 % 3) as usize)
-                    .map(|at| Match { first: at, second: at })
-                    .collect(),
-                median_parallax_rad: 0.1,
-            },
+                (0..80).filter(|at| second < 3 || *at % 2 == 0 || first == (*at / 2 % 3) as usize),
+            ),
         };
         [(0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3)].map(|(a, b)| pair(a, b)).to_vec()
     }

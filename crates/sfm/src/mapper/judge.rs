@@ -214,11 +214,11 @@ impl Mapper<'_> {
 mod tests {
     use nalgebra::{UnitQuaternion, Vector3};
     use rand::Rng;
-    use setloc_features::{Calibration, Camera, ImageFeatures, Keypoint, Match};
+    use setloc_features::{Calibration, Camera, ImageFeatures, Keypoint};
 
     use super::*;
     use crate::mapper::{InputImage, MapperInput, MapperParams, Model, wall};
-    use crate::{CameraId, PairGeometry, TwoView, TwoViewKind, TwoViewParams, synthetic::seeded};
+    use crate::{CameraId, PairGeometry, TwoView, TwoViewParams, synthetic::seeded};
 
     /// Points of one wall fit two rotations, and verification may have taken the other one.
     #[test]
@@ -252,12 +252,7 @@ mod tests {
         let both: Vec<Rigid> = steps.map(|(step, _)| step.first_from_second.inverse()).collect();
         let off_by = |pose: &Rigid| pose.rotation.angle_to(&truth.rotation).to_degrees();
         let other = both.iter().find(|pose| off_by(pose) > 10.0).expect("the wall leaves another pose");
-        let two_view = TwoView {
-            kind: TwoViewKind::General,
-            second_from_first: *other,
-            inliers: (0..120).map(|at| Match { first: at, second: at }).collect(),
-            median_parallax_rad: 0.3,
-        };
+        let two_view = TwoView::of_equal_features(*other, 0..120);
         let pairs = [PairGeometry { first: ImageId(0), second: ImageId(1), two_view }];
         let input = MapperInput {
             cameras: vec![camera.clone()],

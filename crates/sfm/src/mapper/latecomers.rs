@@ -186,7 +186,7 @@ fn crossing(first: &Edge, second: &Edge) -> Option<Rigid> {
 #[cfg(test)]
 mod tests {
     use nalgebra::UnitQuaternion;
-    use setloc_features::{Calibration, Camera, ImageFeatures, Match};
+    use setloc_features::{Calibration, Camera, ImageFeatures};
 
     use super::*;
     use crate::{CameraId, InputImage, Reconstruction, ReconstructionImage, TwoView, TwoViewParams};
@@ -231,12 +231,7 @@ mod tests {
         let pair = |&(first, second, matches): &(u32, u32, u32)| PairGeometry {
             first: ImageId(first),
             second: ImageId(second),
-            two_view: TwoView {
-                kind: TwoViewKind::General,
-                second_from_first: Rigid::identity(),
-                inliers: (0..matches).map(|at| Match { first: at, second: at }).collect(),
-                median_parallax_rad: 0.5,
-            },
+            two_view: TwoView::of_equal_features(Rigid::identity(), 0..matches),
         };
         let pairs: Vec<PairGeometry> = pairs.iter().map(pair).collect();
         let camera = Camera::equirectangular(2048, 1024);

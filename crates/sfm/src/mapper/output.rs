@@ -108,7 +108,7 @@ mod tests {
     use setloc_features::Camera;
 
     use super::*;
-    use crate::{ReconstructionImage, Rigid, TwoView, TwoViewKind};
+    use crate::{ReconstructionImage, Rigid, TwoView};
 
     #[test]
     fn pairs_that_no_component_holds_both_images_of_are_open() {
@@ -126,12 +126,7 @@ mod tests {
         };
         let components = vec![component([true, true, false, false]), component([false, false, true, false])];
         let output = MapperOutput { components, ..MapperOutput::default() };
-        let two_view = TwoView {
-            kind: TwoViewKind::General,
-            second_from_first: Rigid::identity(),
-            inliers: Vec::new(),
-            median_parallax_rad: 0.1,
-        };
+        let two_view = TwoView::of_equal_features(Rigid::identity(), 0..0);
         let pair = |(first, second)| PairGeometry {
             first: ImageId(first),
             second: ImageId(second),

@@ -2,12 +2,12 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::Rng;
-use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint, Match};
+use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
 
 use super::structure::triangulate_image;
 use super::{InputImage, MapperInput, MapperParams, correspondence::CorrespondenceGraph, model::Model};
 use crate::{
-    CameraId, ImageId, PairGeometry, Rigid, TwoView, TwoViewKind, TwoViewParams,
+    CameraId, ImageId, PairGeometry, Rigid, TwoView, TwoViewParams,
     synthetic::{normal, seeded},
 };
 
@@ -102,12 +102,7 @@ fn pair(poses: &[Rigid], first: usize, second: usize, matches: usize) -> PairGeo
     PairGeometry {
         first: ImageId(first as u32),
         second: ImageId(second as u32),
-        two_view: TwoView {
-            kind: TwoViewKind::General,
-            second_from_first: poses[second].inverse() * poses[first],
-            inliers: (0..matches as u32).map(|at| Match { first: at, second: at }).collect(),
-            median_parallax_rad: 0.5,
-        },
+        two_view: TwoView::of_equal_features(poses[second].inverse() * poses[first], 0..matches as u32),
     }
 }
 

@@ -135,12 +135,7 @@ mod tests {
         let camera = Camera { model, width: 100, height: 50, params };
         let geometry = |&(first, second, matches, degrees): &(u32, u32, u32, f64)| {
             let rotation = UnitQuaternion::from_euler_angles(0.0, degrees.to_radians(), 0.0);
-            let two_view = TwoView {
-                kind: TwoViewKind::General,
-                second_from_first: Rigid { rotation, ..Rigid::default() },
-                inliers: (0..matches).map(|at| Match { first: at, second: at }).collect(),
-                median_parallax_rad: 0.1,
-            };
+            let two_view = TwoView::of_equal_features(Rigid { rotation, ..Rigid::default() }, 0..matches);
             PairGeometry { first: ImageId(first), second: ImageId(second), two_view }
         };
         let (features, pairs) = (ImageFeatures::default(), pairs.iter().map(geometry).collect::<Vec<_>>());

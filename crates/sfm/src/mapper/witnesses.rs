@@ -153,7 +153,7 @@ mod tests {
 
     use super::*;
     use crate::{
-        CameraId, InputImage, MapperInput, TwoView, TwoViewKind, TwoViewParams,
+        CameraId, InputImage, MapperInput, TwoView, TwoViewParams,
         synthetic::{random_unit, seeded},
     };
 
@@ -180,12 +180,7 @@ mod tests {
             .map(|other| PairGeometry {
                 first: ImageId(0),
                 second: ImageId(other as u32),
-                two_view: TwoView {
-                    kind: TwoViewKind::General,
-                    second_from_first: pose(other).inverse() * pose(0),
-                    inliers: (0..POINTS as u32).map(|at| Match { first: at, second: at }).collect(),
-                    median_parallax_rad: 0.1,
-                },
+                two_view: TwoView::of_equal_features(pose(other).inverse() * pose(0), 0..POINTS as u32),
             })
             .collect();
         let input = MapperInput {
