@@ -74,8 +74,8 @@ pub use grey::GreyImage;
 pub use mask::Mask;
 pub use matching::{
     DescriptorBlock, Elevations, GuidedParams, Match, MatchParams, Posture, TwoNearest, match_features,
-    match_guided, match_guided_among, match_simulated_views, squared_distance, squared_norm, two_nearest,
-    without_carried,
+    match_guided, match_guided_among, match_simulated_views, offer_nearer, squared_distance, squared_norm,
+    two_nearest, without_carried,
 };
 pub use nearby::NearbyKeypoints;
 pub use patch::{Aligned, ImagePyramid, Patch, PatchFrame, PatchParams, Template};

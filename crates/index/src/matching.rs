@@ -1,6 +1,5 @@
 use std::collections::BTreeMap;
 
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use setloc_features::ImageFeatures;
 use setloc_sfm::PointId;
@@ -115,8 +114,7 @@ impl SceneIndex {
         let mut scene_points: Vec<PointId> = forward.iter().map(|&(_, point, _)| point).collect();
         scene_points.sort_unstable();
         scene_points.dedup();
-        let reverse: Vec<NearestPoints> =
-            scene_points.par_chunks(16).flat_map_iter(|points| self.nearest_local(points, local)).collect();
+        let reverse = self.nearest_local(&scene_points, local);
         forward
             .into_iter()
             .filter_map(|(owner, scene, nearest)| {
@@ -135,12 +133,8 @@ impl SceneIndex {
 
     /// The two local points nearest to each scene point, over all its observations; ids are local points.
     fn nearest_local(&self, points: &[PointId], local: &LocalDescriptors) -> Vec<NearestPoints> {
-        let queries: Vec<u8> = points
-            .iter()
-            .flat_map(|&p| self.rows_of(p))
-            .flat_map(|&row| self.descriptor(row))
-            .copied()
-            .collect();
+        let rows = points.iter().flat_map(|&point| self.rows_of(point));
+        let queries = rows.map(|&row| self.descriptor(row)).collect::<Vec<_>>().concat();
         let nearest = nearest_exact(&queries, &local.descriptors, |row| PointId(local.owners[row]));
         let mut rest = nearest.as_slice();
         points

@@ -7,11 +7,8 @@ use serde::{Deserialize, Serialize};
 use setloc_features::{DESCRIPTOR_LEN, ImageFeatures, squared_distance};
 use setloc_sfm::{ImageId, Observation, PointId, Reconstruction, ReconstructionPoint};
 
-use crate::search::{InvertedLists, PrincipalTree, Search, nearest_exact, scan_rows};
+use crate::search::{InvertedLists, PrincipalTree, Search, nearest_exact};
 use crate::{Backend, IndexParams, NearestPoints};
-
-/// Queries that share one pass over the rows.
-const TILE_QUERIES: usize = 64;
 
 /// Queries of the recall's measurement that are worth handing to another thread; exact ones are one by one.
 const QUERIES_PER_TASK: usize = 8;
@@ -165,11 +162,8 @@ impl SceneIndex {
                 .map(|&row| match &self.search {
                     Search::Exact => self.nearest_among(row, 0..self.rows.len() as u32),
                     Search::Inverted(lists) => {
-                        let ranges = lists.candidates(self.descriptor(row));
-                        self.nearest_among(
-                            row,
-                            ranges.into_iter().flat_map(|range| range.start as u32..range.end as u32),
-                        )
+                        let rows = lists.candidates(self.descriptor(row));
+                        self.nearest_among(row, rows.map(|row| row as u32))
                     }
                     Search::Kiddo(tree) => {
                         self.nearest_among(row, tree.candidates(self.descriptor(row)).into_iter())
@@ -294,29 +288,12 @@ impl SceneIndex {
 
     /// The two nearest scene points of each row-major query descriptor.
     pub fn nearest_points(&self, queries: &[u8]) -> Vec<NearestPoints> {
-        queries
-            .par_chunks(TILE_QUERIES * DESCRIPTOR_LEN)
-            .with_max_len(1)
-            .flat_map_iter(|tile| self.nearest_of_tile(tile))
-            .collect()
-    }
-
-    fn nearest_of_tile(&self, queries: &[u8]) -> Vec<NearestPoints> {
         let owner = |row: usize| self.rows[row].point;
         match &self.search {
             Search::Exact => nearest_exact(queries, &self.descriptors, owner),
-            Search::Inverted(lists) => queries
-                .chunks_exact(DESCRIPTOR_LEN)
-                .map(|query| {
-                    let mut nearest = NearestPoints::default();
-                    for range in lists.candidates(query) {
-                        scan_rows(query, &self.descriptors, range, owner, &mut nearest);
-                    }
-                    nearest
-                })
-                .collect(),
+            Search::Inverted(lists) => lists.nearest(queries, &self.descriptors, owner),
             Search::Kiddo(tree) => queries
-                .chunks_exact(DESCRIPTOR_LEN)
+                .par_chunks_exact(DESCRIPTOR_LEN)
                 .map(|query| {
                     let mut nearest = NearestPoints::default();
                     for row in tree.candidates(query) {

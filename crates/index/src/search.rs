@@ -4,7 +4,7 @@ mod exact;
 mod inverted;
 mod kd_tree;
 
-pub(crate) use exact::{nearest_exact, scan_rows};
+pub(crate) use exact::nearest_exact;
 pub(crate) use inverted::InvertedLists;
 pub(crate) use kd_tree::PrincipalTree;
 

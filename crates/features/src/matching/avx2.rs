@@ -5,15 +5,17 @@
 //! such pairs stay below 2¹⁶ where descriptors [are short](is_short).
 
 use std::arch::x86_64::{
-    __m256i, _mm256_add_epi16, _mm256_add_epi32, _mm256_and_si256, _mm256_castsi256_ps, _mm256_cmpgt_epi32,
-    _mm256_loadu_si256, _mm256_madd_epi16, _mm256_maddubs_epi16, _mm256_movemask_ps, _mm256_set1_epi32,
-    _mm256_slli_epi32, _mm256_srli_epi32, _mm256_storeu_si256, _mm256_sub_epi32,
+    __m256i, _mm256_add_epi16, _mm256_add_epi32, _mm256_and_si256, _mm256_blendv_epi8, _mm256_castsi256_ps,
+    _mm256_cmpgt_epi32, _mm256_loadu_si256, _mm256_madd_epi16, _mm256_maddubs_epi16, _mm256_max_epi32,
+    _mm256_min_epi32, _mm256_movemask_ps, _mm256_or_si256, _mm256_set1_epi32, _mm256_slli_epi32,
+    _mm256_srli_epi32, _mm256_storeu_si256, _mm256_sub_epi32,
 };
 
 use bytemuck::{Pod, Zeroable};
 
-use super::kernel::{Comparisons, Line, PackedBase, PackedQueries, Slots, squared_norm};
-use super::tiles::{self, Instructions, Lanes, Products, VECTORS};
+use super::TwoNearest;
+use super::kernel::{Comparisons, Line, PackedBase, PackedQueries, squared_norm};
+use super::tiles::{self, Instructions, Lanes, Products, Sink, TwoOfColumns, TwoOfRows, VECTORS};
 use crate::DESCRIPTOR_LEN;
 
 /// Queries per register tile; with 2 base vectors that makes 12 accumulators of the 16 registers.
@@ -111,35 +113,46 @@ fn pack_base<K: Instructions<ROWS, LANES>, T: Pod, const PER_LANE: usize>(
     PackedBase { lines, terms }
 }
 
-/// Updates the best two of all rows and, if `both`, of all columns, of those that are compared.
+/// The nearest two of all rows and, if `both`, of all columns, padded, of those that are compared.
+pub(super) fn two_nearest<K: Instructions<ROWS, LANES, Lanes = Avx2>>(
+    kernel: K,
+    queries: &PackedQueries,
+    base: &PackedBase,
+    compared: impl Comparisons,
+    both: bool,
+) -> [Vec<TwoNearest>; 2] {
+    let mut rows = TwoOfRows::new(queries.terms.len());
+    if !both {
+        search(kernel, queries, base, &mut rows, &mut (), compared);
+        return [rows.finish(), Vec::new()];
+    }
+    let mut columns = TwoOfColumns::new(base.terms.len());
+    search(kernel, queries, base, &mut rows, &mut columns, compared);
+    [rows.finish(), columns.finish()]
+}
+
+/// Hands all distances to `rows` and `columns`, of those that are compared.
 pub(super) fn search<K: Instructions<ROWS, LANES, Lanes = Avx2>>(
     kernel: K,
     queries: &PackedQueries,
     base: &PackedBase,
-    rows: &mut Slots,
-    columns: &mut Slots,
+    rows: &mut impl Sink<LANES>,
+    columns: &mut impl Sink<LANES>,
     compared: impl Comparisons,
-    both: bool,
 ) {
     #[target_feature(enable = "avx2")]
-    fn compiled<K: Instructions<ROWS, LANES>, const COLUMNS: bool>(
+    fn compiled<K: Instructions<ROWS, LANES>>(
         kernel: K,
         queries: &PackedQueries,
         base: &PackedBase,
-        rows: &mut Slots,
-        columns: &mut Slots,
+        rows: &mut impl Sink<LANES>,
+        columns: &mut impl Sink<LANES>,
         compared: impl Comparisons,
     ) {
-        tiles::search::<_, ROWS, LANES, COLUMNS>(kernel, queries, base, rows, columns, compared);
+        tiles::search::<_, ROWS, LANES>(kernel, queries, base, rows, columns, compared);
     }
     // SAFETY: the instructions are there, as `kernel` proves.
-    unsafe {
-        if both {
-            compiled::<K, true>(kernel, queries, base, rows, columns, compared);
-        } else {
-            compiled::<K, false>(kernel, queries, base, rows, columns, compared);
-        }
-    }
+    unsafe { compiled(kernel, queries, base, rows, columns, compared) }
 }
 
 // SAFETY of all intrinsics: `self` proves that the instructions are there.
@@ -176,9 +189,12 @@ impl Instructions<ROWS, LANES> for Bytes {
     fn multiply(self, queries: &[Line], base: &[Line]) -> Products<Avx2, ROWS, LANES> {
         let mut products = multiply::<_, { DESCRIPTOR_LEN / 4 }>(self, queries, base);
         let low = self.0.splat(0xffff);
-        for sums in products.iter_mut().flatten() {
-            // SAFETY: as above.
-            *sums = unsafe { _mm256_add_epi32(_mm256_and_si256(*sums, low), _mm256_srli_epi32::<16>(*sums)) };
+        for row in &mut products {
+            for sums in row {
+                // SAFETY: as above.
+                *sums =
+                    unsafe { _mm256_add_epi32(_mm256_and_si256(*sums, low), _mm256_srli_epi32::<16>(*sums)) };
+            }
         }
         products
     }
@@ -236,6 +252,8 @@ fn multiply<K: AddProducts, const STEPS: usize>(
 // SAFETY of all intrinsics: `self` proves that the instructions are there.
 impl Lanes<LANES> for Avx2 {
     type Vector = __m256i;
+    /// All bits of a lane.
+    type Mask = __m256i;
 
     #[inline(always)]
     fn splat(self, value: i32) -> __m256i {
@@ -244,9 +262,8 @@ impl Lanes<LANES> for Avx2 {
     }
 
     #[inline(always)]
-    fn load(self, values: &[i32]) -> __m256i {
-        assert!(values.len() >= LANES);
-        // SAFETY: at least 32 readable bytes, as just checked.
+    fn load(self, values: &[i32; LANES]) -> __m256i {
+        // SAFETY: 32 readable bytes.
         unsafe { _mm256_loadu_si256(values.as_ptr().cast()) }
     }
 
@@ -265,8 +282,38 @@ impl Lanes<LANES> for Avx2 {
     }
 
     #[inline(always)]
-    fn less(self, a: __m256i, b: __m256i) -> u32 {
+    fn min(self, a: __m256i, b: __m256i) -> __m256i {
         // SAFETY: as above.
-        unsafe { _mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpgt_epi32(b, a))) as u32 }
+        unsafe { _mm256_min_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    fn max(self, a: __m256i, b: __m256i) -> __m256i {
+        // SAFETY: as above.
+        unsafe { _mm256_max_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    fn select(self, mask: __m256i, a: __m256i, b: __m256i) -> __m256i {
+        // SAFETY: as above.
+        unsafe { _mm256_blendv_epi8(b, a, mask) }
+    }
+
+    #[inline(always)]
+    fn less(self, a: __m256i, b: __m256i) -> __m256i {
+        // SAFETY: as above.
+        unsafe { _mm256_cmpgt_epi32(b, a) }
+    }
+
+    #[inline(always)]
+    fn or(self, a: __m256i, b: __m256i) -> __m256i {
+        // SAFETY: as above.
+        unsafe { _mm256_or_si256(a, b) }
+    }
+
+    #[inline(always)]
+    fn bits(self, mask: __m256i) -> u32 {
+        // SAFETY: as above.
+        unsafe { _mm256_movemask_ps(_mm256_castsi256_ps(mask)) as u32 }
     }
 }

@@ -4,12 +4,14 @@
 //! q·b = (q − 128)·b + 128 Σb, and the column term becomes ‖b‖² − 256 Σb.
 
 use std::arch::x86_64::{
-    __m512i, _mm512_add_epi32, _mm512_cmplt_epi32_mask, _mm512_dpbusd_epi32, _mm512_loadu_si512,
-    _mm512_set1_epi32, _mm512_slli_epi32, _mm512_storeu_si512, _mm512_sub_epi32,
+    __m512i, __mmask16, _mm512_add_epi32, _mm512_cmplt_epi32_mask, _mm512_dpbusd_epi32, _mm512_loadu_si512,
+    _mm512_mask_blend_epi32, _mm512_max_epi32, _mm512_min_epi32, _mm512_set1_epi32, _mm512_slli_epi32,
+    _mm512_storeu_si512, _mm512_sub_epi32,
 };
 
-use super::kernel::{Comparisons, Line, PackedBase, PackedQueries, Slots};
-use super::tiles::{self, Instructions, Lanes, Products, VECTORS};
+use super::TwoNearest;
+use super::kernel::{Comparisons, Line, PackedBase, PackedQueries};
+use super::tiles::{self, Instructions, Lanes, Products, Sink, TwoOfColumns, TwoOfRows, VECTORS};
 
 /// Queries per register tile; with 2 base vectors that makes 24 accumulators of the 32 registers.
 const ROWS: usize = 12;
@@ -49,36 +51,47 @@ impl Avx512 {
         PackedQueries::new(descriptors, ROWS, |value| value ^ 0x80)
     }
 
+    /// The nearest two of all rows and, if `both`, of all columns, padded, of those that are compared.
+    pub fn two_nearest(
+        self,
+        queries: &PackedQueries,
+        base: &PackedBase,
+        compared: impl Comparisons,
+        both: bool,
+    ) -> [Vec<TwoNearest>; 2] {
+        let mut rows = TwoOfRows::new(queries.terms.len());
+        if !both {
+            self.search(queries, base, &mut rows, &mut (), compared);
+            return [rows.finish(), Vec::new()];
+        }
+        let mut columns = TwoOfColumns::new(base.terms.len());
+        self.search(queries, base, &mut rows, &mut columns, compared);
+        [rows.finish(), columns.finish()]
+    }
+
+    /// Hands all distances to `rows` and `columns`, of those that are compared.
     pub fn search(
         self,
         queries: &PackedQueries,
         base: &PackedBase,
-        rows: &mut Slots,
-        columns: &mut Slots,
+        rows: &mut impl Sink<LANES>,
+        columns: &mut impl Sink<LANES>,
         compared: impl Comparisons,
-        both: bool,
     ) {
-        // SAFETY: the instructions are there, as `self` proves.
-        unsafe {
-            if both {
-                search::<true>(self, queries, base, rows, columns, compared);
-            } else {
-                search::<false>(self, queries, base, rows, columns, compared);
-            }
+        #[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
+        fn compiled(
+            kernel: Avx512,
+            queries: &PackedQueries,
+            base: &PackedBase,
+            rows: &mut impl Sink<LANES>,
+            columns: &mut impl Sink<LANES>,
+            compared: impl Comparisons,
+        ) {
+            tiles::search::<_, ROWS, LANES>(kernel, queries, base, rows, columns, compared);
         }
+        // SAFETY: the instructions are there, as `self` proves.
+        unsafe { compiled(self, queries, base, rows, columns, compared) }
     }
-}
-
-#[target_feature(enable = "avx512f,avx512bw,avx512vnni")]
-fn search<const COLUMNS: bool>(
-    kernel: Avx512,
-    queries: &PackedQueries,
-    base: &PackedBase,
-    rows: &mut Slots,
-    columns: &mut Slots,
-    compared: impl Comparisons,
-) {
-    tiles::search::<_, ROWS, LANES, COLUMNS>(kernel, queries, base, rows, columns, compared);
 }
 
 // SAFETY of all intrinsics: `self` proves that the instructions are there.
@@ -120,6 +133,7 @@ impl Instructions<ROWS, LANES> for Avx512 {
 // SAFETY of all intrinsics: as above.
 impl Lanes<LANES> for Avx512 {
     type Vector = __m512i;
+    type Mask = __mmask16;
 
     #[inline(always)]
     fn splat(self, value: i32) -> __m512i {
@@ -128,9 +142,8 @@ impl Lanes<LANES> for Avx512 {
     }
 
     #[inline(always)]
-    fn load(self, values: &[i32]) -> __m512i {
-        assert!(values.len() >= LANES);
-        // SAFETY: at least 64 readable bytes, as just checked.
+    fn load(self, values: &[i32; LANES]) -> __m512i {
+        // SAFETY: 64 readable bytes.
         unsafe { _mm512_loadu_si512(values.as_ptr().cast()) }
     }
 
@@ -149,8 +162,36 @@ impl Lanes<LANES> for Avx512 {
     }
 
     #[inline(always)]
-    fn less(self, a: __m512i, b: __m512i) -> u32 {
+    fn min(self, a: __m512i, b: __m512i) -> __m512i {
         // SAFETY: as above.
-        u32::from(unsafe { _mm512_cmplt_epi32_mask(a, b) })
+        unsafe { _mm512_min_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    fn max(self, a: __m512i, b: __m512i) -> __m512i {
+        // SAFETY: as above.
+        unsafe { _mm512_max_epi32(a, b) }
+    }
+
+    #[inline(always)]
+    fn select(self, mask: __mmask16, a: __m512i, b: __m512i) -> __m512i {
+        // SAFETY: as above.
+        unsafe { _mm512_mask_blend_epi32(mask, b, a) }
+    }
+
+    #[inline(always)]
+    fn less(self, a: __m512i, b: __m512i) -> __mmask16 {
+        // SAFETY: as above.
+        unsafe { _mm512_cmplt_epi32_mask(a, b) }
+    }
+
+    #[inline(always)]
+    fn or(self, a: __mmask16, b: __mmask16) -> __mmask16 {
+        a | b
+    }
+
+    #[inline(always)]
+    fn bits(self, mask: __mmask16) -> u32 {
+        u32::from(mask)
     }
 }

@@ -7,8 +7,10 @@
 //! updates, so the product dominates.
 
 use bytemuck::{Pod, Zeroable};
+use rayon::prelude::*;
 
 use super::count;
+use super::tiles::Offers;
 #[cfg(target_arch = "x86_64")]
 use super::{
     avx2::{self, Avx2},
@@ -184,23 +186,48 @@ impl Kernel {
         }
     }
 
-    fn search(
+    /// The nearest two of all queries and, if `both`, of all base descriptors, with those that they are padded with.
+    fn two_nearest(
         self,
         queries: &PackedQueries,
         base: &PackedBase,
-        rows: &mut Slots,
-        columns: &mut Slots,
         compared: impl Comparisons,
         both: bool,
-    ) {
+    ) -> [Vec<TwoNearest>; 2] {
         match self {
-            Self::Scalar => search_scalar(queries, base, rows, columns, compared),
+            Self::Scalar => {
+                let mut found =
+                    [&queries.terms, &base.terms].map(|terms| vec![TwoNearest::NONE; terms.len()]);
+                let [rows, columns] = &mut found;
+                search_scalar(queries, base, compared, |row, column, distance2| {
+                    rows[row].offer(column as u32, distance2 as u32);
+                    columns[column].offer(row as u32, distance2 as u32);
+                });
+                found
+            }
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2Words(kernel) => avx2::search(kernel, queries, base, rows, columns, compared, both),
+            Self::Avx2Words(kernel) => avx2::two_nearest(kernel, queries, base, compared, both),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2Bytes(kernel) => avx2::search(kernel, queries, base, rows, columns, compared, both),
+            Self::Avx2Bytes(kernel) => avx2::two_nearest(kernel, queries, base, compared, both),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512(kernel) => kernel.search(queries, base, rows, columns, compared, both),
+            Self::Avx512(kernel) => kernel.two_nearest(queries, base, compared, both),
+        }
+    }
+
+    /// Offers to the queries what is nearer than their bounds.
+    fn offer(self, queries: &PackedQueries, base: &PackedBase, mut rows: Offers<'_>) {
+        match self {
+            Self::Scalar => search_scalar(queries, base, All, |row, column, distance2| {
+                if distance2 < rows.bounds[row] {
+                    rows.bounds[row] = (rows.offer)(row, distance2, column);
+                }
+            }),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2Words(kernel) => avx2::search(kernel, queries, base, &mut rows, &mut (), All),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2Bytes(kernel) => avx2::search(kernel, queries, base, &mut rows, &mut (), All),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(kernel) => kernel.search(queries, base, &mut rows, &mut (), All),
         }
     }
 }
@@ -237,43 +264,6 @@ impl PackedQueries {
         let mut terms = terms_of(descriptors);
         terms.resize(padded, PADDING);
         Self { lines, terms }
-    }
-}
-
-/// Best two per row or column, as parallel arrays; padding entries are never updated.
-pub(super) struct Slots {
-    pub best: Vec<i32>,
-    pub second: Vec<i32>,
-    pub index: Vec<u32>,
-}
-
-impl Slots {
-    fn new(len: usize, padded: usize) -> Self {
-        let mut second = vec![UNSEEN; len];
-        second.resize(padded, i32::MIN);
-        Self { best: vec![UNSEEN; padded], second, index: vec![TwoNearest::NO_INDEX; padded] }
-    }
-
-    #[inline(always)]
-    pub fn update(&mut self, slot: usize, distance2: i32, index: usize) {
-        if distance2 < self.best[slot] {
-            self.second[slot] = self.best[slot];
-            self.best[slot] = distance2;
-            self.index[slot] = index as u32;
-        } else if distance2 < self.second[slot] {
-            self.second[slot] = distance2;
-        }
-    }
-
-    fn finish(&self, len: usize) -> Vec<TwoNearest> {
-        let distance = |value: i32| if value == UNSEEN { TwoNearest::NO_DISTANCE } else { value as u32 };
-        (0..len)
-            .map(|slot| TwoNearest {
-                index: self.index[slot],
-                distance2: distance(self.best[slot]),
-                second_distance2: distance(self.second[slot]),
-            })
-            .collect()
     }
 }
 
@@ -349,18 +339,57 @@ impl DescriptorBlock {
         compared: impl Comparisons,
         both: bool,
     ) -> (Vec<TwoNearest>, Vec<TwoNearest>) {
-        let num_queries = count(queries);
         let packed = self.kernel.pack_queries(queries);
-        let mut rows = Slots::new(num_queries, packed.terms.len());
-        let mut columns = Slots::new(self.len, self.base.terms.len());
-        self.kernel.search(&packed, &self.base, &mut rows, &mut columns, compared, both);
-        (rows.finish(num_queries), if both { columns.finish(self.len) } else { Vec::new() })
+        let [mut rows, mut columns] = self.kernel.two_nearest(&packed, &self.base, compared, both);
+        rows.truncate(count(queries));
+        columns.truncate(if both { self.len } else { 0 });
+        (rows, columns)
     }
 }
 
 /// The two nearest of `base` for each of `queries` (both row-major, `n × DESCRIPTOR_LEN` bytes).
 pub fn two_nearest(queries: &[u8], base: &[u8]) -> Vec<TwoNearest> {
     DescriptorBlock::with_kernel(Kernel::detect_for(queries, base), base).two_nearest(queries)
+}
+
+/// Queries that are compared with all of a base by one thread at a time; whole blocks.
+const QUERIES_AT_ONCE: usize = 16 * QUERY_BLOCK;
+
+/// Offers each query the descriptors of `base` that are nearer than what it has found so far asks for.
+///
+/// For searches that keep something else than the two nearest descriptors: `bound` tells below which squared distance a further
+/// descriptor matters to a query, and `offer` takes such a one, by its number in `base`, in ascending order. Both of `queries` and
+/// `base` are row-major, `n × DESCRIPTOR_LEN` bytes; `found` has an entry a query.
+///
+/// ```
+/// use setloc_features::{DESCRIPTOR_LEN, offer_nearer};
+///
+/// let base = [10, 20, 12].map(|value| [value; DESCRIPTOR_LEN]).concat();
+/// // All that are nearer than 128 · 3².
+/// let mut found = [vec![]];
+/// offer_nearer(&[11; DESCRIPTOR_LEN], &base, &mut found, |_| 1152, |found, at, distance2| found.push((at, distance2)));
+/// assert_eq!(found, [[(0, 128), (2, 128)]]);
+/// ```
+pub fn offer_nearer<F: Send>(
+    queries: &[u8],
+    base: &[u8],
+    found: &mut [F],
+    bound: impl Fn(&F) -> u32 + Sync,
+    offer: impl Fn(&mut F, usize, u32) + Sync,
+) {
+    let block = DescriptorBlock::with_kernel(Kernel::detect_for(queries, base), base);
+    let parts = queries.par_chunks(QUERIES_AT_ONCE * DESCRIPTOR_LEN).with_max_len(1);
+    parts.zip(found.par_chunks_mut(QUERIES_AT_ONCE)).for_each(|(queries, found)| {
+        let queries = block.kernel.pack_queries(queries);
+        let bound = |found: &F| bound(found).min(UNSEEN as u32) as i32;
+        let mut bounds: Vec<i32> = found.iter().map(bound).collect();
+        bounds.resize(queries.terms.len(), i32::MIN);
+        let mut offer = |row: usize, distance2: i32, column: usize| {
+            offer(&mut found[row], column, distance2 as u32);
+            bound(&found[row])
+        };
+        block.kernel.offer(&queries, &block.base, Offers { bounds, offer: &mut offer });
+    });
 }
 
 /// Both directions in one pass: for each query its nearest two of `base`, for each of `base` its nearest two queries, among
@@ -417,12 +446,12 @@ fn terms_of(descriptors: &[u8]) -> Vec<i32> {
     descriptors.chunks_exact(DESCRIPTOR_LEN).map(squared_norm).collect()
 }
 
+/// Hands all squared distances on, by row and column.
 fn search_scalar(
     queries: &PackedQueries,
     base: &PackedBase,
-    rows: &mut Slots,
-    columns: &mut Slots,
     compared: impl Comparisons,
+    mut take: impl FnMut(usize, usize, i32),
 ) {
     let base_bytes: &[u8] = bytemuck::cast_slice(&base.lines);
     let query_bytes: &[u8] = bytemuck::cast_slice(&queries.lines);
@@ -430,9 +459,7 @@ fn search_scalar(
         let candidates = base_bytes.chunks_exact(DESCRIPTOR_LEN).enumerate();
         for (column, candidate) in candidates.filter(|(column, _)| compared.has(row, *column)) {
             let product: i32 = query.iter().zip(candidate).map(|(&a, &b)| i32::from(a) * i32::from(b)).sum();
-            let distance2 = queries.terms[row] + base.terms[column] - 2 * product;
-            rows.update(row, distance2, column);
-            columns.update(column, distance2, row);
+            take(row, column, queries.terms[row] + base.terms[column] - 2 * product);
         }
     }
 }

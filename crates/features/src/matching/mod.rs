@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Camera, DESCRIPTOR_LEN, DESCRIPTOR_NORM, FeatureError, ImageFeatures, Keypoint};
 pub use guided::{GuidedParams, match_guided, match_guided_among};
-pub use kernel::{DescriptorBlock, TwoNearest, squared_distance, squared_norm, two_nearest};
+pub use kernel::{DescriptorBlock, TwoNearest, offer_nearer, squared_distance, squared_norm, two_nearest};
 
 /// A putative or verified match: keypoint `first` of one image shows what keypoint `second` of another shows.
 #[derive(

@@ -1,6 +1,7 @@
 //! The walk over register tiles that the vector kernels share.
 
-use super::kernel::{BASE_BLOCK, Comparisons, Line, PackedBase, PackedQueries, QUERY_BLOCK, Slots};
+use super::TwoNearest;
+use super::kernel::{BASE_BLOCK, Comparisons, Line, PackedBase, PackedQueries, QUERY_BLOCK, UNSEEN};
 
 /// Base vectors per register tile.
 pub(super) const VECTORS: usize = 2;
@@ -33,11 +34,13 @@ pub(super) type Products<L, const ROWS: usize, const LANES: usize> =
 pub(super) trait Lanes<const LANES: usize>: Copy {
     /// `LANES` integers of 32 bits.
     type Vector: Copy;
+    /// What holds for each lane.
+    type Mask: Copy;
 
     /// `value` in every lane.
     fn splat(self, value: i32) -> Self::Vector;
-    /// The first `LANES` values.
-    fn load(self, values: &[i32]) -> Self::Vector;
+    /// These values.
+    fn load(self, values: &[i32; LANES]) -> Self::Vector;
     /// All lanes.
     fn store(self, vector: Self::Vector) -> [i32; LANES];
     /// column term + row term − 2 · product.
@@ -47,18 +50,56 @@ pub(super) trait Lanes<const LANES: usize>: Copy {
         column_terms: Self::Vector,
         row_term: Self::Vector,
     ) -> Self::Vector;
-    /// One bit per lane in which `a` is less than `b`.
-    fn less(self, a: Self::Vector, b: Self::Vector) -> u32;
+    /// The smaller of both, lane by lane.
+    fn min(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+    /// The larger of both, lane by lane.
+    fn max(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+    /// `a` in the lanes of a mask, `b` in the others.
+    fn select(self, mask: Self::Mask, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+    /// The lanes in which `a` is less than `b`.
+    fn less(self, a: Self::Vector, b: Self::Vector) -> Self::Mask;
+    /// The lanes of either.
+    fn or(self, a: Self::Mask, b: Self::Mask) -> Self::Mask;
+    /// One bit per lane.
+    fn bits(self, mask: Self::Mask) -> u32;
 }
 
-/// Updates the best two of all rows and, with `COLUMNS`, of all columns, of those that are compared.
+/// Squared distances of a tile, `LANES` a vector.
+pub(super) type Distances<L, const ROWS: usize, const LANES: usize> = Products<L, ROWS, LANES>;
+
+/// Takes the squared distances of the tiles, those of a row in ascending order of columns and the other way round.
+pub(super) trait Sink<const LANES: usize> {
+    /// Takes a tile that starts at this row and column.
+    fn take<L: Lanes<LANES>, const ROWS: usize>(
+        &mut self,
+        lanes: L,
+        distances: &Distances<L, ROWS, LANES>,
+        row: usize,
+        column: usize,
+    );
+}
+
+/// Where nobody asks.
+impl<const LANES: usize> Sink<LANES> for () {
+    #[inline(always)]
+    fn take<L: Lanes<LANES>, const ROWS: usize>(
+        &mut self,
+        _: L,
+        _: &Distances<L, ROWS, LANES>,
+        _: usize,
+        _: usize,
+    ) {
+    }
+}
+
+/// Hands all distances to `rows` and `columns`, of those that are compared.
 #[inline(always)]
-pub(super) fn search<K, const ROWS: usize, const LANES: usize, const COLUMNS: bool>(
+pub(super) fn search<K, const ROWS: usize, const LANES: usize>(
     kernel: K,
     queries: &PackedQueries,
     base: &PackedBase,
-    rows: &mut Slots,
-    columns: &mut Slots,
+    rows: &mut impl Sink<LANES>,
+    columns: &mut impl Sink<LANES>,
     compared: impl Comparisons,
 ) where
     K: Instructions<ROWS, LANES>,
@@ -66,93 +107,205 @@ pub(super) fn search<K, const ROWS: usize, const LANES: usize, const COLUMNS: bo
     const {
         assert!(QUERY_BLOCK.is_multiple_of(ROWS) && BASE_BLOCK.is_multiple_of(LANES * VECTORS));
     }
-    let num_columns = base.terms.len();
+    let (num_columns, lanes) = (base.terms.len(), kernel.lanes());
+    let (column_terms, _) = base.terms.as_chunks::<LANES>();
     for tile in (0..num_columns).step_by(K::TILE) {
         let tile_end = (tile + K::TILE).min(num_columns);
         for row in (0..queries.terms.len()).step_by(ROWS) {
             let query_lines = &queries.lines[row * K::QUERY_LINES..(row + ROWS) * K::QUERY_LINES];
+            let row_terms: &[i32; ROWS] = queries.terms[row..].first_chunk().expect("a full tile of queries");
             for column in (tile..tile_end).step_by(LANES * VECTORS) {
                 if !compared.has(row, column) {
                     continue;
                 }
-                let first = column / LANES * K::BASE_LINES;
-                let base_lines = &base.lines[first..first + VECTORS * K::BASE_LINES];
-                let products = kernel.multiply(query_lines, base_lines);
-                update::<K::Lanes, ROWS, LANES, COLUMNS>(
-                    kernel.lanes(),
-                    &products,
-                    row,
-                    column,
-                    queries,
-                    base,
-                    rows,
-                    columns,
-                );
+                let first = column / LANES;
+                let base_lines = &base.lines[first * K::BASE_LINES..(first + VECTORS) * K::BASE_LINES];
+                let mut distances = kernel.multiply(query_lines, base_lines);
+                let column_terms: &[[i32; LANES]; VECTORS] =
+                    column_terms[first..].first_chunk().expect("a full tile of base descriptors");
+                for offset in 0..ROWS {
+                    let row_term = lanes.splat(row_terms[offset]);
+                    for vector in 0..VECTORS {
+                        let (product, term) = (distances[offset][vector], lanes.load(&column_terms[vector]));
+                        distances[offset][vector] = lanes.distances(product, term, row_term);
+                    }
+                }
+                rows.take(lanes, &distances, row, column);
+                columns.take(lanes, &distances, row, column);
             }
         }
     }
 }
 
-#[expect(clippy::too_many_arguments, reason = "the loop's own variables, inlined back into it")]
-#[inline(always)]
-fn update<L, const ROWS: usize, const LANES: usize, const COLUMNS: bool>(
-    lanes: L,
-    products: &Products<L, ROWS, LANES>,
-    row: usize,
-    column: usize,
-    queries: &PackedQueries,
-    base: &PackedBase,
-    rows: &mut Slots,
-    columns: &mut Slots,
-) where
-    L: Lanes<LANES>,
-{
-    for vector in 0..VECTORS {
-        let column = column + vector * LANES;
-        let column_terms = lanes.load(&base.terms[column..column + LANES]);
-        let mut column_second = lanes.load(&columns.second[column..column + LANES]);
+/// The nearest two of one vector of rows or columns, each lane by itself; without a branch, as most of them change many times.
+#[derive(Clone, Copy)]
+struct LaneTwo<const LANES: usize> {
+    best: [i32; LANES],
+    second: [i32; LANES],
+    /// What was given with the nearest.
+    index: [i32; LANES],
+}
+
+impl<const LANES: usize> LaneTwo<LANES> {
+    const NONE: Self = Self { best: [UNSEEN; LANES], second: [UNSEEN; LANES], index: [-1; LANES] };
+
+    /// Takes vectors of distances, each with what stands for it, in this order.
+    #[inline(always)]
+    fn take<L: Lanes<LANES>, const N: usize>(
+        &mut self,
+        lanes: L,
+        distances: [L::Vector; N],
+        indices: [L::Vector; N],
+    ) {
+        let (mut best, mut second) = (lanes.load(&self.best), lanes.load(&self.second));
+        let mut index = lanes.load(&self.index);
+        for at in 0..N {
+            let nearer = lanes.less(distances[at], best);
+            second = lanes.min(second, lanes.max(best, distances[at]));
+            best = lanes.min(best, distances[at]);
+            index = lanes.select(nearer, indices[at], index);
+        }
+        self.best = lanes.store(best);
+        self.second = lanes.store(second);
+        self.index = lanes.store(index);
+    }
+
+    /// What one lane has found, `offset` added to its index.
+    fn found(&self, lane: usize, offset: usize) -> TwoNearest {
+        let distance = |value: i32| if value == UNSEEN { TwoNearest::NO_DISTANCE } else { value as u32 };
+        let index = usize::try_from(self.index[lane]);
+        TwoNearest {
+            index: index.map_or(TwoNearest::NO_INDEX, |index| (index + offset) as u32),
+            distance2: distance(self.best[lane]),
+            second_distance2: distance(self.second[lane]),
+        }
+    }
+}
+
+/// The nearest two of each row: those of every `LANES`-th column by themselves.
+pub(super) struct TwoOfRows<const LANES: usize>(Vec<LaneTwo<LANES>>);
+
+impl<const LANES: usize> TwoOfRows<LANES> {
+    pub fn new(rows: usize) -> Self {
+        Self(vec![LaneTwo::NONE; rows])
+    }
+
+    pub fn finish(&self) -> Vec<TwoNearest> {
+        let of_row = |lanes: &LaneTwo<LANES>| {
+            (0..LANES).map(|lane| lanes.found(lane, lane)).fold(TwoNearest::NONE, |found, other| {
+                // Of equally near ones the lowest index.
+                let is_first = (found.distance2, found.index) <= (other.distance2, other.index);
+                let (mut first, second) = if is_first { (found, other) } else { (other, found) };
+                first.merge(&second);
+                first
+            })
+        };
+        self.0.iter().map(of_row).collect()
+    }
+}
+
+impl<const LANES: usize> Sink<LANES> for TwoOfRows<LANES> {
+    #[inline(always)]
+    fn take<L: Lanes<LANES>, const ROWS: usize>(
+        &mut self,
+        lanes: L,
+        distances: &Distances<L, ROWS, LANES>,
+        row: usize,
+        column: usize,
+    ) {
+        let mut columns = [lanes.splat(column as i32); VECTORS];
+        for vector in 1..VECTORS {
+            columns[vector] = lanes.splat((column + vector * LANES) as i32);
+        }
+        let rows: &mut [LaneTwo<LANES>; ROWS] =
+            self.0[row..].first_chunk_mut().expect("a full tile of queries");
+        for offset in 0..ROWS {
+            rows[offset].take(lanes, distances[offset], columns);
+        }
+    }
+}
+
+/// The nearest two of each column.
+pub(super) struct TwoOfColumns<const LANES: usize>(Vec<LaneTwo<LANES>>);
+
+impl<const LANES: usize> TwoOfColumns<LANES> {
+    pub fn new(columns: usize) -> Self {
+        Self(vec![LaneTwo::NONE; columns.div_ceil(LANES)])
+    }
+
+    pub fn finish(&self) -> Vec<TwoNearest> {
+        self.0.iter().flat_map(|lanes| (0..LANES).map(|lane| lanes.found(lane, 0))).collect()
+    }
+}
+
+impl<const LANES: usize> Sink<LANES> for TwoOfColumns<LANES> {
+    #[inline(always)]
+    fn take<L: Lanes<LANES>, const ROWS: usize>(
+        &mut self,
+        lanes: L,
+        distances: &Distances<L, ROWS, LANES>,
+        row: usize,
+        column: usize,
+    ) {
+        let columns: &mut [LaneTwo<LANES>; VECTORS] =
+            self.0[column / LANES..].first_chunk_mut().expect("a full tile of base descriptors");
+        for vector in 0..VECTORS {
+            let mut of_vector = [lanes.splat(0); ROWS];
+            let mut rows = of_vector;
+            for offset in 0..ROWS {
+                of_vector[offset] = distances[offset][vector];
+                rows[offset] = lanes.splat((row + offset) as i32);
+            }
+            columns[vector].take(lanes, of_vector, rows);
+        }
+    }
+}
+
+/// Rows that hand on what is nearer than their bounds.
+pub(super) struct Offers<'a> {
+    /// For each row, padded, the squared distance below which a base descriptor is offered.
+    pub bounds: Vec<i32>,
+    /// Takes row, squared distance and column, and tells the row's new bound.
+    pub offer: &'a mut dyn FnMut(usize, i32, usize) -> i32,
+}
+
+impl<const LANES: usize> Sink<LANES> for Offers<'_> {
+    #[inline(always)]
+    fn take<L: Lanes<LANES>, const ROWS: usize>(
+        &mut self,
+        lanes: L,
+        distances: &Distances<L, ROWS, LANES>,
+        row: usize,
+        column: usize,
+    ) {
+        let bounds: &[i32; ROWS] = self.bounds[row..].first_chunk().expect("a full tile of queries");
+        let mut any = None;
+        for offset in 0..ROWS {
+            let bound = lanes.splat(bounds[offset]);
+            for vector in 0..VECTORS {
+                let near = lanes.less(distances[offset][vector], bound);
+                any = Some(any.map_or(near, |any| lanes.or(any, near)));
+            }
+        }
+        // Of most tiles nothing is.
+        if any.is_none_or(|any| lanes.bits(any) == 0) {
+            return;
+        }
         for offset in 0..ROWS {
             let row = row + offset;
-            let row_term = lanes.splat(queries.terms[row]);
-            let distances = lanes.distances(products[offset][vector], column_terms, row_term);
-            let nearer_in_row = lanes.less(distances, lanes.splat(rows.second[row]));
-            let nearer_in_column = if COLUMNS { lanes.less(distances, column_second) } else { 0 };
-            if nearer_in_row | nearer_in_column != 0 {
-                let values = lanes.store(distances);
-                update_rows(&values, nearer_in_row, row, column, rows);
-                if COLUMNS && nearer_in_column != 0 {
-                    update_columns(&values, nearer_in_column, row, column, columns);
-                    column_second = lanes.load(&columns.second[column..column + LANES]);
+            for vector in 0..VECTORS {
+                let mut near =
+                    lanes.bits(lanes.less(distances[offset][vector], lanes.splat(self.bounds[row])));
+                let values = lanes.store(distances[offset][vector]);
+                while near != 0 {
+                    let lane = near.trailing_zeros() as usize;
+                    near &= near - 1;
+                    // An earlier lane may have lowered the bound.
+                    if values[lane] < self.bounds[row] {
+                        self.bounds[row] = (self.offer)(row, values[lane], column + vector * LANES + lane);
+                    }
                 }
             }
         }
-    }
-}
-
-fn update_rows<const LANES: usize>(
-    values: &[i32; LANES],
-    mut mask: u32,
-    row: usize,
-    column: usize,
-    rows: &mut Slots,
-) {
-    while mask != 0 {
-        let lane = mask.trailing_zeros() as usize;
-        rows.update(row, values[lane], column + lane);
-        mask &= mask - 1;
-    }
-}
-
-fn update_columns<const LANES: usize>(
-    values: &[i32; LANES],
-    mut mask: u32,
-    row: usize,
-    column: usize,
-    columns: &mut Slots,
-) {
-    while mask != 0 {
-        let lane = mask.trailing_zeros() as usize;
-        columns.update(column + lane, values[lane], row);
-        mask &= mask - 1;
     }
 }
