@@ -229,26 +229,30 @@ fn in_each<T: Send, E: Send>(
     found.into_iter().collect()
 }
 
-/// The frame of a patch by where its steps (x, y) lie, to the second order, from the places `reach` steps from its middle;
-/// `full_turn_px` where the image closes round it.
+/// Where in a patch [`second_order`] looks: its middle, then places to the left, right, above, below, and at two corners.
+pub(crate) const STENCIL: [[f64; 2]; 7] =
+    [[0.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0], [1.0, 1.0], [-1.0, -1.0]];
+
+/// The frame of a patch by where its steps (x, y) lie, to the second order, from where it has the places of [`STENCIL`], by their
+/// number there, in units of `reach` steps; `full_turn_px` where the image closes round it.
 pub(crate) fn second_order(
-    place: impl Fn(f64, f64) -> Option<Vector2<f64>>,
+    place: impl Fn(usize) -> Option<Vector2<f64>>,
     reach: f64,
     full_turn_px: Option<f64>,
 ) -> Option<PatchFrame> {
-    let center = place(0.0, 0.0)?;
-    let from_middle = |x: f64, y: f64| {
-        let mut offset = place(x, y)? - center;
+    let center = place(0)?;
+    let from_middle = |number: usize| {
+        let mut offset = place(number)? - center;
         if let Some(turn) = full_turn_px {
             offset.x -= turn * (offset.x / turn).round();
         }
         Some(offset)
     };
     let h = reach;
-    let [left, right] = [from_middle(-h, 0.0)?, from_middle(h, 0.0)?];
-    let [above, below] = [from_middle(0.0, -h)?, from_middle(0.0, h)?];
+    let [left, right] = [from_middle(1)?, from_middle(2)?];
+    let [above, below] = [from_middle(3)?, from_middle(4)?];
     let (along_x, along_y) = (right + left, below + above);
-    let mixed = 0.5 * (from_middle(h, h)? + from_middle(-h, -h)? - along_x - along_y);
+    let mixed = 0.5 * (from_middle(5)? + from_middle(6)? - along_x - along_y);
     let curvature =
         [0, 1].map(|axis| Matrix2::new(along_x[axis], mixed[axis], mixed[axis], along_y[axis]) / (h * h));
     let pixel_from_patch = Matrix2::from_columns(&[right - left, below - above]) / (2.0 * h);
@@ -419,11 +423,11 @@ impl<'a> Tracks<'a> {
         let camera = self.component.camera_of(image);
         let camera_from_world = self.component.images[image.index()].world_from_camera?.inverse();
         let position = self.component.points[point].position;
-        let place = |x: f64, y: f64| {
-            let on_plane = self.planes[point] * Vector2::new(x, y) * spacing;
+        let reach = 0.5 * self.params.patch.radius as f64;
+        let place = |number: usize| {
+            let on_plane = self.planes[point] * (Vector2::from(STENCIL[number]) * reach) * spacing;
             camera.project(&camera_from_world.transform_point(&(position + on_plane)))
         };
-        let reach = 0.5 * self.params.patch.radius as f64;
         let PatchFrame { curvature, .. } = second_order(place, reach, camera.full_turn_px())?;
         Some(PatchFrame { center, pixel_from_patch: pixel_from_plane * spacing, curvature })
     }

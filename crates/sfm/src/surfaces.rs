@@ -267,7 +267,7 @@ impl Compared {
             fine: cut(&PATCH, step)?,
             coarse: cut(&COARSE, step * COARSER)?,
             pyramid: &other.pyramid,
-            frame: own.frame_in(other, &other_from_own, &surface, &place.pixel)?,
+            frame: other.frame_of(&other_from_own, &surface, &own.stencil(&place.pixel))?,
         };
         let here = sought.is_alike_about(Vector2::zeros())?;
         let turn = (number % 8) as f64 * std::f64::consts::FRAC_PI_4;

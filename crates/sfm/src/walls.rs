@@ -309,7 +309,7 @@ impl<'a> Sweep<'a> {
             let normal = view.world_from_camera.rotation.inverse() * wall.plane.normal;
             let ground = Ground { normal, distance: depth * normal.dot(&piece.bearing) };
             let other_from_self = look.view.world_from_camera.inverse() * view.world_from_camera;
-            let frame = view.frame_in(&look.view, &other_from_self, &ground, &piece.pixel)?;
+            let frame = look.view.frame_of(&other_from_self, &ground, &piece.stencil)?;
             if coarse.correlation(&look.view.pyramid, &coarser(&frame))? < MIN_COARSE {
                 return None;
             }
@@ -344,7 +344,7 @@ impl<'a> Sweep<'a> {
     ) -> Option<(Vector3<f64>, Matrix3<f64>)> {
         let ray_of = |look: &Look<'_>| {
             let other_from_self = look.view.world_from_camera.inverse() * view.world_from_camera;
-            let frame = view.frame_in(&look.view, &other_from_self, &laid.plane, &piece.pixel)?;
+            let frame = look.view.frame_of(&other_from_self, &laid.plane, &piece.stencil)?;
             let found = piece.template.align(&look.view.pyramid, &frame, MIN_FIRST)?;
             let off = (found.pixel - frame.center).norm();
             let is_alike = found.correlation >= MIN_CORRELATION && off <= MAX_OFF * frame.spacing();

@@ -1,3 +1,6 @@
+use std::cell::RefCell;
+use std::sync::OnceLock;
+
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 use serde::{Deserialize, Serialize};
 
@@ -5,11 +8,10 @@ use super::ImagePyramid;
 use super::pyramid::{Grid, Quadratic, Samples};
 use crate::FeatureError;
 use crate::error::check;
+use crate::{vectorized, vectorized::Level};
 
 /// Largest radius of a patch.
 const MAX_RADIUS: usize = 50;
-/// Its samples in a row.
-const MAX_ACROSS: usize = 2 * MAX_RADIUS + 1;
 
 /// How patches are aligned.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -222,9 +224,10 @@ impl Template {
     /// How the image at `frame` correlates with the template as it is; `None` where it leaves the image.
     pub fn correlation(&self, pyramid: &ImagePyramid, frame: &PatchFrame) -> Option<f64> {
         let grid = frame.grid(&Matrix2::identity(), &Vector2::zeros());
-        let mut samples = Samples::default();
-        let inside = pyramid.sample(pyramid.level_for(frame.spacing()), &grid, self.radius, &mut samples);
-        inside.then(|| self.fit(&window(self.radius), &samples.values).correlation)
+        SAMPLES.with_borrow_mut(|samples| {
+            let inside = pyramid.sample(pyramid.level_for(frame.spacing()), &grid, self.radius, samples);
+            inside.then(|| self.fit(window(self.radius), &samples.values).correlation)
+        })
     }
 
     /// Finds the template near the middle of `frame`, which also gives the expected shape; `None` where it is not.
@@ -234,10 +237,11 @@ impl Template {
     pub fn align(&self, pyramid: &ImagePyramid, frame: &PatchFrame, least_at_first: f64) -> Option<Aligned> {
         let level = pyramid.level_for(frame.spacing());
         let (mut shape, mut shift) = (Matrix2::identity(), Vector2::zeros());
-        let (window, mut samples) = (window(self.radius), Samples::default());
-        let mut fit = |shape: &Matrix2<f64>, shift: &Vector2<f64>| {
-            let inside = pyramid.sample(level, &frame.grid(shape, shift), self.radius, &mut samples);
-            inside.then(|| self.fit(&window, &samples.values))
+        let fit = |shape: &Matrix2<f64>, shift: &Vector2<f64>| {
+            SAMPLES.with_borrow_mut(|samples| {
+                let inside = pyramid.sample(level, &frame.grid(shape, shift), self.radius, samples);
+                inside.then(|| self.fit(window(self.radius), &samples.values))
+            })
         };
         let mut found = fit(&shape, &shift).filter(|first| first.correlation >= least_at_first)?;
         for _ in 0..self.params.max_iterations {
@@ -277,64 +281,102 @@ impl Template {
 
     /// θ for the samples of an image, row by row.
     fn fit(&self, window: &[f32], values: &[f32]) -> Fit {
-        let (side, across) = (self.radius * 2 + 3, window.len());
-        // Sums over the rows, column by column: of T_x, y·T_x, T_y, y·T_y, T and 1 times I, and of I².
-        let mut sums = [const { [0.0_f32; MAX_ACROSS] }; 7];
-        let [dx, dxy, dy, dyy, own, one, squared] = &mut sums;
-        for (y, (&weight, values)) in window.iter().zip(values.chunks_exact(across)).enumerate() {
-            let qy = y as f32 - self.radius as f32;
-            let row = |step: usize| &self.samples[(y + step) * side..(y + step + 1) * side];
-            let (above, row, below) = (&row(0)[1..=across], row(1), &row(2)[1..=across]);
-            let (left, here, right) = (&row[..across], &row[1..=across], &row[2..]);
-            for x in 0..across {
-                let value = values[x] - self.mean;
-                let weighted = weight * value;
-                let (by_x, by_y) = ((right[x] - left[x]) * weighted, (below[x] - above[x]) * weighted);
-                dx[x] += by_x;
-                dxy[x] += qy * by_x;
-                dy[x] += by_y;
-                dyy[x] += qy * by_y;
-                own[x] += here[x] * weighted;
-                one[x] += weighted;
-                squared[x] += value * weighted;
-            }
-        }
-        let total = |sums: &[f32], factor: &dyn Fn(f64) -> f64| -> f64 {
-            let weighted = window.iter().zip(sums).enumerate();
-            let term = |(x, (weight, sum)): (usize, (&f32, &f32))| {
-                f64::from(*weight) * f64::from(*sum) * factor(x as f64 - self.radius as f64)
-            };
-            weighted.map(term).sum()
-        };
-        // Half, since the gradient is half of the difference.
-        let (half, half_x, whole) = (|_: f64| 0.5, |qx: f64| 0.5 * qx, |_: f64| 1.0);
-        let right = SVector::from([
-            total(dx, &half),
-            total(dy, &half),
-            total(dx, &half_x),
-            total(dxy, &half),
-            total(dy, &half_x),
-            total(dyy, &half),
-            total(own, &whole),
-            total(one, &whole),
-        ]);
-        let (theta, squared) = (self.inverse * right, total(squared, &whole));
-        let variance = squared - right[7] * right[7];
+        let sums = weighted_sums(Level::detect(), &self.samples, window, values, self.mean);
+        let [dx, dy, dx_x, dx_y, dy_x, dy_y, own, one, squared] = sums;
+        // The gradient is half of the difference.
+        let right =
+            SVector::from([0.5 * dx, 0.5 * dy, 0.5 * dx_x, 0.5 * dx_y, 0.5 * dy_x, 0.5 * dy_y, own, one]);
+        let theta = self.inverse * right;
+        let variance = squared - one * one;
         Fit {
             theta,
             remaining: (squared - theta.dot(&right)).max(0.0),
-            correlation: right[6] / (self.variance * variance).sqrt(),
+            correlation: own / (self.variance * variance).sqrt(),
         }
     }
 }
 
+vectorized! {
+    /// Sums under Ω of 2 T_x, 2 T_y, 2 T_x·q, 2 T_y·q, T and 1 times I, and of I² (`values` less `mean`).
+    fn weighted_sums(samples: &[f32], window: &[f32], values: &[f32], mean: f32) -> [f64; UNKNOWNS + 1] {
+        const BLOCK: usize = 8;
+        let mut sums = [0.0; UNKNOWNS + 1];
+        let mut at = 0;
+        while at + BLOCK <= window.len() {
+            add_columns::<BLOCK>(samples, window, values, mean, at, &mut sums);
+            at += BLOCK;
+        }
+        while at < window.len() {
+            add_columns::<1>(samples, window, values, mean, at, &mut sums);
+            at += 1;
+        }
+        sums
+    }
+}
+
+/// Adds the sums over `N` columns side by side, from column `at` on.
+#[inline(always)]
+fn add_columns<const N: usize>(
+    samples: &[f32],
+    window: &[f32],
+    values: &[f32],
+    mean: f32,
+    at: usize,
+    sums: &mut [f64; UNKNOWNS + 1],
+) {
+    let (across, radius) = (window.len(), window.len() / 2);
+    let side = across + 2;
+    let [mut dx, mut dx_y, mut dy, mut dy_y, mut own, mut one, mut squared] = [[0.0_f32; N]; 7];
+    for (y, &weight) in window.iter().enumerate() {
+        let qy = y as f32 - radius as f32;
+        let (row, value): (_, &[f32; N]) = ((y + 1) * side + at, cut(values, y * across + at));
+        let (left, here, right) = (cut(samples, row), cut(samples, row + 1), cut(samples, row + 2));
+        let (above, below) = (cut(samples, row + 1 - side), cut(samples, row + 1 + side));
+        let [left, here, right, above, below]: [&[f32; N]; 5] = [left, here, right, above, below];
+        for x in 0..N {
+            let value = value[x] - mean;
+            let weighted = weight * value;
+            let (by_x, by_y) = ((right[x] - left[x]) * weighted, (below[x] - above[x]) * weighted);
+            dx[x] += by_x;
+            dx_y[x] += qy * by_x;
+            dy[x] += by_y;
+            dy_y[x] += qy * by_y;
+            own[x] += here[x] * weighted;
+            one[x] += weighted;
+            squared[x] += value * weighted;
+        }
+    }
+    for x in 0..N {
+        let (weight, qx) = (f64::from(window[at + x]), (at + x) as f64 - radius as f64);
+        let terms = [dx[x], dy[x], dx[x], dx_y[x], dy[x], dy_y[x], own[x], one[x], squared[x]];
+        let factors = [1.0, 1.0, qx, 1.0, qx, 1.0, 1.0, 1.0, 1.0];
+        for term in 0..=UNKNOWNS {
+            sums[term] += weight * f64::from(terms[term]) * factors[term];
+        }
+    }
+}
+
+/// `N` values from the one `at` on.
+#[inline(always)]
+fn cut<const N: usize>(values: &[f32], at: usize) -> &[f32; N] {
+    values[at..].first_chunk().expect("as many samples as the patch has")
+}
+
 /// One factor of Ω, which is the same along both axes, of sum one.
-fn window(radius: usize) -> Vec<f32> {
-    let falloff = -0.5 / (WINDOW * radius as f64).powi(2);
-    let weights = |x: isize| (falloff * (x * x) as f64).exp();
-    let radius = radius as isize;
-    let sum: f64 = (-radius..=radius).map(weights).sum();
-    (-radius..=radius).map(|x| (weights(x) / sum) as f32).collect()
+fn window(radius: usize) -> &'static [f32] {
+    static WINDOWS: [OnceLock<Vec<f32>>; MAX_RADIUS + 1] = [const { OnceLock::new() }; MAX_RADIUS + 1];
+    WINDOWS[radius].get_or_init(|| {
+        let falloff = -0.5 / (WINDOW * radius as f64).powi(2);
+        let weights = |x: isize| (falloff * (x * x) as f64).exp();
+        let radius = radius as isize;
+        let sum: f64 = (-radius..=radius).map(weights).sum();
+        (-radius..=radius).map(|x| (weights(x) / sum) as f32).collect()
+    })
+}
+
+thread_local! {
+    /// What patches are sampled into: many a millisecond are.
+    static SAMPLES: RefCell<Samples> = RefCell::default();
 }
 
 #[cfg(test)]

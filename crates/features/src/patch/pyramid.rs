@@ -79,10 +79,8 @@ impl ImagePyramid {
         split(Level::detect(), columns, rows, width as i32, offsets);
         if inside {
             let first = origin[1] * width + origin[0];
-            corners.extend(offsets.iter().map(|&offset| {
-                let at = (first + offset as isize) as usize;
-                level.corners([at, at + 1])
-            }));
+            corners
+                .extend(offsets.iter().map(|&offset| level.corners_at((first + offset as isize) as usize)));
         }
         values.resize(corners.len(), 0.0);
         interpolate(Level::detect(), corners, columns, rows, values);
@@ -115,25 +113,10 @@ impl Quadratic {
 
     /// The places on a level, from the pixel `origin` of it on; returns the lowest and the highest.
     fn places(&self, scale: f64, origin: f64, radius: usize, places: &mut Vec<f32>) -> (f32, f32) {
-        let reach = radius as i32;
-        let (mut lowest, mut highest) = (f32::INFINITY, f32::NEG_INFINITY);
-        places.clear();
-        let square = (scale * self.square[0]) as f32;
-        for y in -reach..=reach {
-            let y = f64::from(y);
-            let constant = self.constant + y * (self.linear[1] + y * self.square[1]);
-            let constant = (scale * constant - 0.5 - origin) as f32;
-            let linear = (scale * (self.linear[0] + y * self.mixed)) as f32;
-            places.extend((-reach..=reach).map(|x| {
-                let x = x as f32;
-                constant + x * (linear + x * square)
-            }));
-        }
-        for &place in &*places {
-            lowest = if place < lowest { place } else { lowest };
-            highest = if place > highest { place } else { highest };
-        }
-        (lowest, highest)
+        let across = 2 * radius + 1;
+        places.resize(across * across, 0.0);
+        fill(Level::detect(), self, scale, origin, across, places);
+        ends(Level::detect(), places)
     }
 }
 
@@ -155,6 +138,14 @@ impl GreyImage {
         [values[left], values[right], values[left + self.width], values[right + self.width]]
     }
 
+    /// A pixel, the one beside it, and those below them.
+    #[inline]
+    fn corners_at(&self, at: usize) -> [u8; 4] {
+        let two = |at: usize| *self.values[at..].first_chunk::<2>().expect("two pixels of a row");
+        let ([a, b], [c, d]) = (two(at), two(at + self.width));
+        [a, b, c, d]
+    }
+
     /// Half the size, each pixel from 4 × 4 by the weights (1, 3, 3, 1)/8: its centre is that of the 2 × 2 it stands for.
     fn halved(&self, wraps_around: bool) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
@@ -174,6 +165,58 @@ impl GreyImage {
             halve_row(Level::detect(), &sums, target);
         }
         Self { width, height, values }
+    }
+}
+
+vectorized! {
+    /// The places that a function has on a level, row by row of a patch, from the pixel `origin` on.
+    fn fill(axis: &Quadratic, scale: f64, origin: f64, across: usize, places: &mut [f32]) {
+        let radius = across as i32 / 2;
+        let square = (scale * axis.square[0]) as f32;
+        for (y, row) in places.chunks_exact_mut(across).enumerate() {
+            let y = f64::from(y as i32 - radius);
+            let constant = axis.constant + y * (axis.linear[1] + y * axis.square[1]);
+            let constant = (scale * constant - 0.5 - origin) as f32;
+            let linear = (scale * (axis.linear[0] + y * axis.mixed)) as f32;
+            // Blocks of one size fill a register each; a loop over a row is too short for what compilers make of it.
+            let (blocks, rest) = row.as_chunks_mut::<8>();
+            let mut from = -radius;
+            for block in blocks {
+                for (place, lane) in block.iter_mut().zip(0..) {
+                    let x = (from + lane) as f32;
+                    *place = constant + x * (linear + x * square);
+                }
+                from += 8;
+            }
+            for place in rest {
+                let x = from as f32;
+                *place = constant + x * (linear + x * square);
+                from += 1;
+            }
+        }
+    }
+}
+
+vectorized! {
+    /// The lowest and the highest of some finite places.
+    fn ends(places: &[f32]) -> (f32, f32) {
+        const LANES: usize = 16;
+        let (mut lowest, mut highest) = ([f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES]);
+        let (blocks, rest) = places.as_chunks::<LANES>();
+        for block in blocks {
+            for lane in 0..LANES {
+                lowest[lane] = if block[lane] < lowest[lane] { block[lane] } else { lowest[lane] };
+                highest[lane] = if block[lane] > highest[lane] { block[lane] } else { highest[lane] };
+            }
+        }
+        let mut of_all = (f32::INFINITY, f32::NEG_INFINITY);
+        for &place in lowest.iter().chain(rest) {
+            of_all.0 = if place < of_all.0 { place } else { of_all.0 };
+        }
+        for &place in highest.iter().chain(rest) {
+            of_all.1 = if place > of_all.1 { place } else { of_all.1 };
+        }
+        of_all
     }
 }
 

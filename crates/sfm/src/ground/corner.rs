@@ -132,6 +132,12 @@ impl Sought {
         let area = std::f64::consts::PI * (TOLERANCE * self.spacing).powi(2);
         self.places.len() as f64 * area / self.area
     }
+
+    /// That it is seen there, by a patch of which one step spans so many pixels.
+    fn at(&self, in_second: Vector2<f64>, spacing: f64) -> Place {
+        let Piece { pixel, bearing, .. } = self.piece;
+        Place { column: pixel.x, bearing, in_second, sigma: PLACE_SIGMA * spacing }
+    }
 }
 
 /// A state with the patches that it was fitted to.
@@ -145,7 +151,9 @@ struct Fitted {
 /// A patch with the place where the second photo shows it.
 #[derive(Clone, Copy)]
 struct Place {
-    in_first: Vector2<f64>,
+    /// Of its pixel in the first.
+    column: f64,
+    bearing: Vector3<f64>,
     in_second: Vector2<f64>,
     sigma: f64,
 }
@@ -162,19 +170,19 @@ impl Search<'_> {
         self.floor.ground(&state.fixed_rows::<3>(6).into_owned())
     }
 
-    fn seen(&self, state: &State, pixel: &Vector2<f64>) -> Option<Vector2<f64>> {
-        self.from.seen_by(self.to, &self.second_from_first(state), &self.ground(state), pixel)
+    fn seen(&self, state: &State, bearing: &Vector3<f64>) -> Option<Vector2<f64>> {
+        self.to.shows(&self.second_from_first(state), &self.ground(state), bearing)
     }
 
-    fn frame(&self, state: &State, pixel: &Vector2<f64>) -> Option<PatchFrame> {
-        self.from.frame_in(self.to, &self.second_from_first(state), &self.ground(state), pixel)
+    fn frame(&self, state: &State, piece: &Piece) -> Option<PatchFrame> {
+        self.to.frame_of(&self.second_from_first(state), &self.ground(state), &piece.stencil)
     }
 
     /// The place and its derivatives, each by a step to either side.
     fn linear(
         &self,
         state: &State,
-        pixel: &Vector2<f64>,
+        bearing: &Vector3<f64>,
         step: f64,
     ) -> Option<(Vector2<f64>, SMatrix<f64, 2, UNKNOWNS>)> {
         let mut rows = SMatrix::<f64, 2, UNKNOWNS>::zeros();
@@ -182,18 +190,18 @@ impl Search<'_> {
             let moved = |by: f64| {
                 let mut state = *state;
                 state[axis] += by;
-                self.seen(&state, pixel)
+                self.seen(&state, bearing)
             };
             rows.set_column(axis, &((moved(step)? - moved(-step)?) / (2.0 * step)));
         }
-        Some((self.seen(state, pixel)?, rows))
+        Some((self.seen(state, bearing)?, rows))
     }
 
     fn find(&self) -> Option<Sharpened> {
         let ground = self.ground(&State::zeros());
         let near = |met: Vector3<f64>| met.norm() <= MAX_DISTANCE * ground.distance;
-        let pieces = self.from.pieces(DENSE, |bearing, pixel| {
-            ground.meets(bearing).is_some_and(near) && self.uncertainty(pixel).is_some()
+        let pieces = self.from.pieces(DENSE, |bearing, _| {
+            ground.meets(bearing).is_some_and(near) && self.uncertainty(bearing).is_some()
         });
         let stride = pieces.len().div_ceil(MAX_PIECES).max(1);
         let pieces: Vec<Piece> = pieces.into_iter().step_by(stride).collect();
@@ -241,7 +249,7 @@ impl Search<'_> {
             state = minimize::<UNKNOWNS, _>(&Fit { search: self, places: &places }, state, STEPS);
         }
         let correlation = |sought: &Sought| {
-            let frame = self.frame(&state, &sought.piece.pixel)?;
+            let frame = self.frame(&state, &sought.piece)?;
             sought.piece.template.correlation(&self.to.pyramid, &frame)
         };
         let likeness =
@@ -249,9 +257,9 @@ impl Search<'_> {
         Fitted { state, places, likeness }
     }
 
-    /// Covariance of the place where a pixel is expected; `None` where it cannot be seen.
-    fn uncertainty(&self, pixel: &Vector2<f64>) -> Option<(Vector2<f64>, Matrix2<f64>)> {
-        let (place, rows) = self.linear(&State::zeros(), pixel, COARSE)?;
+    /// Where a bearing's ground is expected, and the covariance of that; `None` where it cannot be seen.
+    fn uncertainty(&self, bearing: &Vector3<f64>) -> Option<(Vector2<f64>, Matrix2<f64>)> {
+        let (place, rows) = self.linear(&State::zeros(), bearing, COARSE)?;
         let covariance = rows * rows.transpose();
         let reach = covariance.diagonal().map(|variance| SEARCH_SIGMAS * variance.sqrt());
         let inside = place.x > -reach.x
@@ -263,8 +271,8 @@ impl Search<'_> {
 
     /// The places of a patch in the second photo; `None` where that shows it smaller than the first does, or nowhere.
     fn seek(&self, piece: Piece) -> Option<Sought> {
-        let (place, covariance) = self.uncertainty(&piece.pixel)?;
-        let frame = self.frame(&State::zeros(), &piece.pixel)?;
+        let (place, covariance) = self.uncertainty(&piece.bearing)?;
+        let frame = self.frame(&State::zeros(), &piece)?;
         let spacing = frame.spacing();
         let covariance = covariance + Matrix2::identity() * spacing.powi(2);
         let inverse = covariance.try_inverse()?;
@@ -305,7 +313,7 @@ impl Search<'_> {
 
     /// How well the second photo shows a patch where it is expected, from 0 to 1.
     fn agreement(&self, pose: &Rigid, ground: &Ground, sought: &Sought) -> Option<f64> {
-        let place = self.from.seen_by(self.to, pose, ground, &sought.piece.pixel)?;
+        let place = self.to.shows(pose, ground, &sought.piece.bearing)?;
         let errors = sought.places.iter().map(|found| (found - place).norm());
         let error = errors.fold(f64::INFINITY, f64::min) / (TOLERANCE * sought.spacing);
         (error < 1.0).then_some(1.0 - error * error)
@@ -328,9 +336,8 @@ impl Search<'_> {
             let first = rng.random_range(0..sought.len());
             let second = (first + rng.random_range(1..sought.len())) % sought.len();
             [first, second].map(|at| {
-                let Sought { piece, places, spacing, .. } = &sought[at];
-                let in_second = places[rng.random_range(0..places.len())];
-                Place { in_first: piece.pixel, in_second, sigma: PLACE_SIGMA * spacing }
+                let sought = &sought[at];
+                sought.at(sought.places[rng.random_range(0..sought.places.len())], sought.spacing)
             })
         };
         let samples: Vec<[Place; 2]> = (0..SAMPLES).map(|_| sample()).collect();
@@ -363,8 +370,8 @@ impl Search<'_> {
     fn are_apart(&self, state: &State, other: &State, agreeing: &[&Sought]) -> bool {
         let known = [state, other].map(|state| (self.second_from_first(state), self.ground(state)));
         let apart = |sought: &&&Sought| {
-            let pixel = &sought.piece.pixel;
-            let places = [0, 1].map(|at| self.from.seen_by(self.to, &known[at].0, &known[at].1, pixel));
+            let bearing = &sought.piece.bearing;
+            let places = [0, 1].map(|at| self.to.shows(&known[at].0, &known[at].1, bearing));
             let [Some(a), Some(b)] = places else { return true };
             (a - b).norm() > APART * sought.spacing
         };
@@ -374,15 +381,11 @@ impl Search<'_> {
     /// Where the second photo shows the patches near where a state has them.
     fn places(&self, state: &State, sought: &[Sought]) -> Vec<Place> {
         let place = |sought: &Sought| {
-            let frame = self.frame(state, &sought.piece.pixel)?;
+            let frame = self.frame(state, &sought.piece)?;
             let spacing = frame.spacing();
             let found = sought.piece.template.align(&self.to.pyramid, &frame, MIN_FIRST)?;
             let near = (found.pixel - frame.center).norm() <= TOLERANCE * spacing;
-            near.then_some(Place {
-                in_first: sought.piece.pixel,
-                in_second: found.pixel,
-                sigma: PLACE_SIGMA * spacing,
-            })
+            near.then(|| sought.at(found.pixel, spacing))
         };
         sought.par_iter().with_max_len(4).filter_map(place).collect()
     }
@@ -398,7 +401,7 @@ impl Search<'_> {
         let mut covariance = inverse.fixed_view::<6, 6>(0, 0).into_owned();
         // Patches are in rows: neighbours are so across.
         let mut order: Vec<usize> = (0..places.len()).collect();
-        order.sort_by(|&a, &b| places[a].in_first.x.total_cmp(&places[b].in_first.x).then(a.cmp(&b)));
+        order.sort_by(|&a, &b| places[a].column.total_cmp(&places[b].column).then(a.cmp(&b)));
         let without = |group: usize| {
             let kept = order.iter().enumerate().filter(|(at, _)| at * GROUPS / order.len() != group);
             let places: Vec<Place> = kept.map(|(_, &at)| places[at]).collect();
@@ -441,7 +444,7 @@ impl LeastSquares<UNKNOWNS> for Fit<'_> {
             normal.add(*value, &SVector::ith(axis, 1.0), 1.0);
         }
         for place in self.places {
-            let Some((seen, rows)) = self.search.linear(state, &place.in_first, FINE) else { continue };
+            let Some((seen, rows)) = self.search.linear(state, &place.bearing, FINE) else { continue };
             let (loss, weight) = place.loss(&seen);
             cost += loss;
             let weight = weight * place.information();
@@ -455,7 +458,7 @@ impl LeastSquares<UNKNOWNS> for Fit<'_> {
 
     fn cost(&self, state: &State) -> f64 {
         let of_places = self.places.iter().map(|place| {
-            self.search.seen(state, &place.in_first).map_or(f64::INFINITY, |seen| place.loss(&seen).0)
+            self.search.seen(state, &place.bearing).map_or(f64::INFINITY, |seen| place.loss(&seen).0)
         });
         state.norm_squared() + of_places.sum::<f64>()
     }

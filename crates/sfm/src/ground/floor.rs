@@ -135,7 +135,7 @@ fn sweep(
     let steps = ((HEIGHTS[1] / HEIGHTS[0]).ln() / HEIGHT_STEP.ln()) as i32;
     let at_height = |step: i32| {
         let ground = Ground { normal, distance: baseline * HEIGHTS[0] * HEIGHT_STEP.powi(step) };
-        let frame = first.frame_in(second, &second_from_first, &ground, &piece.pixel)?;
+        let frame = second.frame_of(&second_from_first, &ground, &piece.stencil)?;
         let found = piece.template.align(&second.pyramid, &frame, MIN_FIRST)?;
         if found.correlation < MIN_CORRELATION {
             return None;

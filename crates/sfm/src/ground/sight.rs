@@ -6,7 +6,10 @@ use nalgebra::{Matrix2, Vector2, Vector3};
 use setloc_features::{Camera, ImagePyramid, Patch, PatchFrame, Template};
 
 use super::{PATCH, floor::Ground};
-use crate::{Rigid, alignment::second_order};
+use crate::{
+    Rigid,
+    alignment::{STENCIL, second_order},
+};
 
 /// Pixels of an image this wide that a step of a patch spans; wider ones in proportion.
 const REFERENCE_WIDTH: f64 = 800.0;
@@ -25,8 +28,14 @@ pub(crate) struct View<'a> {
 pub(crate) struct Piece {
     pub pixel: Vector2<f64>,
     pub bearing: Vector3<f64>,
+    pub stencil: Stencil,
     pub template: Template,
 }
+
+/// Bearings of a patch at the places of [`STENCIL`], where the camera has them: taken once for all planes that the patch is laid on.
+pub(crate) struct Stencil([Option<Vector3<f64>>; STENCIL.len()]);
+/// Steps from the middle of a patch to the places of its stencil.
+const REACH: f64 = 0.5 * PATCH.radius as f64;
 
 /// Pixels of a patch's step in images of a camera.
 pub(crate) fn step_px(camera: &Camera) -> f64 {
@@ -63,34 +72,35 @@ impl View<'_> {
                 curvature: [Matrix2::zeros(); 2],
             };
             let template = Template::new(&PATCH, Patch::cut(&PATCH, &self.pyramid, &frame)?)?;
-            Some(Piece { pixel, bearing, template })
+            Some(Piece { pixel, bearing, stencil: self.stencil(&pixel), template })
         };
         places.filter_map(piece).collect()
     }
 
-    /// Where `other` shows on a plane what this view shows at a pixel; `None` where it cannot.
-    pub fn seen_by(
-        &self,
-        other: &View<'_>,
-        other_from_self: &Rigid,
-        ground: &Ground,
-        pixel: &Vector2<f64>,
-    ) -> Option<Vector2<f64>> {
-        other.camera.project(&other_from_self.transform_point(&ground.meets(&self.camera.unproject(pixel)?)?))
+    /// The bearings that tell where a patch about a pixel lies elsewhere.
+    pub fn stencil(&self, pixel: &Vector2<f64>) -> Stencil {
+        let step = self.step_px();
+        Stencil(STENCIL.map(|place| self.camera.unproject(&(pixel + Vector2::from(place) * REACH * step))))
     }
 
-    /// The frame in which `other` shows a patch of this view that lies on a plane.
-    pub fn frame_in(
+    /// Where this view shows what another one shows on a plane at a bearing; `None` where it cannot.
+    pub fn shows(
         &self,
-        other: &View<'_>,
-        other_from_self: &Rigid,
+        self_from_other: &Rigid,
         ground: &Ground,
-        pixel: &Vector2<f64>,
+        bearing: &Vector3<f64>,
+    ) -> Option<Vector2<f64>> {
+        self.camera.project(&self_from_other.transform_point(&ground.meets(bearing)?))
+    }
+
+    /// The frame in which this view shows a patch of another one that lies on a plane.
+    pub fn frame_of(
+        &self,
+        self_from_other: &Rigid,
+        ground: &Ground,
+        Stencil(bearings): &Stencil,
     ) -> Option<PatchFrame> {
-        let step = self.step_px();
-        let place = |x: f64, y: f64| {
-            self.seen_by(other, other_from_self, ground, &(pixel + Vector2::new(x, y) * step))
-        };
-        second_order(place, 0.5 * PATCH.radius as f64, other.camera.full_turn_px())
+        let place = |number: usize| self.shows(self_from_other, ground, bearings[number].as_ref()?);
+        second_order(place, REACH, self.camera.full_turn_px())
     }
 }
