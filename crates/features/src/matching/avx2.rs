@@ -13,9 +13,8 @@ use std::arch::x86_64::{
 
 use bytemuck::{Pod, Zeroable};
 
-use super::TwoNearest;
 use super::kernel::{Comparisons, Line, PackedBase, PackedQueries, squared_norm};
-use super::tiles::{self, Instructions, Lanes, Products, Sink, TwoOfColumns, TwoOfRows, VECTORS};
+use super::tiles::{self, Instructions, Lanes, Products, Sink, VECTORS, Walk};
 use crate::DESCRIPTOR_LEN;
 
 /// Queries per register tile; with 2 base vectors that makes 12 accumulators of the 16 registers.
@@ -113,46 +112,29 @@ fn pack_base<K: Instructions<ROWS, LANES>, T: Pod, const PER_LANE: usize>(
     PackedBase { lines, terms }
 }
 
-/// The nearest two of all rows and, if `both`, of all columns, padded, of those that are compared.
-pub(super) fn two_nearest<K: Instructions<ROWS, LANES, Lanes = Avx2>>(
-    kernel: K,
-    queries: &PackedQueries,
-    base: &PackedBase,
-    compared: impl Comparisons,
-    both: bool,
-) -> [Vec<TwoNearest>; 2] {
-    let mut rows = TwoOfRows::new(queries.terms.len());
-    if !both {
-        search(kernel, queries, base, &mut rows, &mut (), compared);
-        return [rows.finish(), Vec::new()];
-    }
-    let mut columns = TwoOfColumns::new(base.terms.len());
-    search(kernel, queries, base, &mut rows, &mut columns, compared);
-    [rows.finish(), columns.finish()]
-}
-
-/// Hands all distances to `rows` and `columns`, of those that are compared.
-pub(super) fn search<K: Instructions<ROWS, LANES, Lanes = Avx2>>(
-    kernel: K,
-    queries: &PackedQueries,
-    base: &PackedBase,
-    rows: &mut impl Sink<LANES>,
-    columns: &mut impl Sink<LANES>,
-    compared: impl Comparisons,
-) {
-    #[target_feature(enable = "avx2")]
-    fn compiled<K: Instructions<ROWS, LANES>>(
-        kernel: K,
+impl<K: Instructions<ROWS, LANES, Lanes = Avx2>> Walk<LANES> for K {
+    fn search(
+        self,
         queries: &PackedQueries,
         base: &PackedBase,
         rows: &mut impl Sink<LANES>,
         columns: &mut impl Sink<LANES>,
         compared: impl Comparisons,
     ) {
-        tiles::search::<_, ROWS, LANES>(kernel, queries, base, rows, columns, compared);
+        #[target_feature(enable = "avx2")]
+        fn compiled<K: Instructions<ROWS, LANES>>(
+            kernel: K,
+            queries: &PackedQueries,
+            base: &PackedBase,
+            rows: &mut impl Sink<LANES>,
+            columns: &mut impl Sink<LANES>,
+            compared: impl Comparisons,
+        ) {
+            tiles::search::<_, ROWS, LANES>(kernel, queries, base, rows, columns, compared);
+        }
+        // SAFETY: the instructions are there, as `self` proves.
+        unsafe { compiled(self, queries, base, rows, columns, compared) }
     }
-    // SAFETY: the instructions are there, as `kernel` proves.
-    unsafe { compiled(kernel, queries, base, rows, columns, compared) }
 }
 
 // SAFETY of all intrinsics: `self` proves that the instructions are there.

@@ -9,9 +9,8 @@ use std::arch::x86_64::{
     _mm512_storeu_si512, _mm512_sub_epi32,
 };
 
-use super::TwoNearest;
 use super::kernel::{Comparisons, Line, PackedBase, PackedQueries};
-use super::tiles::{self, Instructions, Lanes, Products, Sink, TwoOfColumns, TwoOfRows, VECTORS};
+use super::tiles::{self, Instructions, Lanes, Products, Sink, VECTORS, Walk};
 
 /// Queries per register tile; with 2 base vectors that makes 24 accumulators of the 32 registers.
 const ROWS: usize = 12;
@@ -50,27 +49,10 @@ impl Avx512 {
     pub fn pack_queries(descriptors: &[u8]) -> PackedQueries {
         PackedQueries::new(descriptors, ROWS, |value| value ^ 0x80)
     }
+}
 
-    /// The nearest two of all rows and, if `both`, of all columns, padded, of those that are compared.
-    pub fn two_nearest(
-        self,
-        queries: &PackedQueries,
-        base: &PackedBase,
-        compared: impl Comparisons,
-        both: bool,
-    ) -> [Vec<TwoNearest>; 2] {
-        let mut rows = TwoOfRows::new(queries.terms.len());
-        if !both {
-            self.search(queries, base, &mut rows, &mut (), compared);
-            return [rows.finish(), Vec::new()];
-        }
-        let mut columns = TwoOfColumns::new(base.terms.len());
-        self.search(queries, base, &mut rows, &mut columns, compared);
-        [rows.finish(), columns.finish()]
-    }
-
-    /// Hands all distances to `rows` and `columns`, of those that are compared.
-    pub fn search(
+impl Walk<LANES> for Avx512 {
+    fn search(
         self,
         queries: &PackedQueries,
         base: &PackedBase,

@@ -15,6 +15,7 @@ use super::tiles::Offers;
 use super::{
     avx2::{self, Avx2},
     avx512::Avx512,
+    tiles::Walk,
 };
 use crate::DESCRIPTOR_LEN;
 
@@ -206,9 +207,9 @@ impl Kernel {
                 found
             }
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2Words(kernel) => avx2::two_nearest(kernel, queries, base, compared, both),
+            Self::Avx2Words(kernel) => kernel.two_nearest(queries, base, compared, both),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2Bytes(kernel) => avx2::two_nearest(kernel, queries, base, compared, both),
+            Self::Avx2Bytes(kernel) => kernel.two_nearest(queries, base, compared, both),
             #[cfg(target_arch = "x86_64")]
             Self::Avx512(kernel) => kernel.two_nearest(queries, base, compared, both),
         }
@@ -223,9 +224,9 @@ impl Kernel {
                 }
             }),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2Words(kernel) => avx2::search(kernel, queries, base, &mut rows, &mut (), All),
+            Self::Avx2Words(kernel) => kernel.search(queries, base, &mut rows, &mut (), All),
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2Bytes(kernel) => avx2::search(kernel, queries, base, &mut rows, &mut (), All),
+            Self::Avx2Bytes(kernel) => kernel.search(queries, base, &mut rows, &mut (), All),
             #[cfg(target_arch = "x86_64")]
             Self::Avx512(kernel) => kernel.search(queries, base, &mut rows, &mut (), All),
         }

@@ -92,6 +92,37 @@ impl<const LANES: usize> Sink<LANES> for () {
     }
 }
 
+/// [`search`], compiled for a kernel's instructions.
+pub(super) trait Walk<const LANES: usize>: Copy {
+    /// Hands all distances to `rows` and `columns`, of those that are compared.
+    fn search(
+        self,
+        queries: &PackedQueries,
+        base: &PackedBase,
+        rows: &mut impl Sink<LANES>,
+        columns: &mut impl Sink<LANES>,
+        compared: impl Comparisons,
+    );
+
+    /// The nearest two of all rows and, if `both`, of all columns, padded, of those that are compared.
+    fn two_nearest(
+        self,
+        queries: &PackedQueries,
+        base: &PackedBase,
+        compared: impl Comparisons,
+        both: bool,
+    ) -> [Vec<TwoNearest>; 2] {
+        let mut rows = TwoOfRows::new(queries.terms.len());
+        if !both {
+            self.search(queries, base, &mut rows, &mut (), compared);
+            return [rows.finish(), Vec::new()];
+        }
+        let mut columns = TwoOfColumns::new(base.terms.len());
+        self.search(queries, base, &mut rows, &mut columns, compared);
+        [rows.finish(), columns.finish()]
+    }
+}
+
 /// Hands all distances to `rows` and `columns`, of those that are compared.
 #[inline(always)]
 pub(super) fn search<K, const ROWS: usize, const LANES: usize>(
@@ -137,7 +168,7 @@ pub(super) fn search<K, const ROWS: usize, const LANES: usize>(
     }
 }
 
-/// The nearest two of one vector of rows or columns, each lane by itself; without a branch, as most of them change many times.
+/// The nearest two of one vector of rows or columns, each lane by itself and without a branch, as many of them change often.
 #[derive(Clone, Copy)]
 struct LaneTwo<const LANES: usize> {
     best: [i32; LANES],
@@ -148,6 +179,17 @@ struct LaneTwo<const LANES: usize> {
 
 impl<const LANES: usize> LaneTwo<LANES> {
     const NONE: Self = Self { best: [UNSEEN; LANES], second: [UNSEEN; LANES], index: [-1; LANES] };
+
+    /// Whether any of these is one of the nearest two of its lane.
+    #[inline(always)]
+    fn is_any_nearer<L: Lanes<LANES>, const N: usize>(&self, lanes: L, distances: [L::Vector; N]) -> bool {
+        let second = lanes.load(&self.second);
+        let mut any = lanes.less(distances[0], second);
+        for at in 1..N {
+            any = lanes.or(any, lanes.less(distances[at], second));
+        }
+        lanes.bits(any) != 0
+    }
 
     /// Takes vectors of distances, each with what stands for it, in this order.
     #[inline(always)]
@@ -256,7 +298,9 @@ impl<const LANES: usize> Sink<LANES> for TwoOfColumns<LANES> {
                 of_vector[offset] = distances[offset][vector];
                 rows[offset] = lanes.splat((row + offset) as i32);
             }
-            columns[vector].take(lanes, of_vector, rows);
+            if columns[vector].is_any_nearer(lanes, of_vector) {
+                columns[vector].take(lanes, of_vector, rows);
+            }
         }
     }
 }
