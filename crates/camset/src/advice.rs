@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
-use setloc_sfm::PairGeometry;
+use setloc_sfm::{MOST_NAMED, PairGeometry, listed};
 
 /// What ties two photos, or the scene and a photo, together.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -45,32 +45,48 @@ impl PathToScene {
 
     /// What to do about a photo that is not localized well.
     pub fn advice(&self) -> String {
+        format!("{}: {}", self.photo, self.remedy())
+    }
+
+    /// The same without the photo's name: photos beyond one weak link have it in common.
+    fn remedy(&self) -> String {
         match (self.weakest(), &self.open) {
             (_, Some(Link { from: Some(from), to, shared })) => format!(
-                "{}: its weakest link: {from} and {to} share {shared} matches, which do not tell how far apart they were \
-                 taken, as those of one wall; take another photo between {from} and {to} that also shows something near",
-                self.photo
+                "the weakest link: {from} and {to} share {shared} matches, which do not tell how far apart they were \
+                 taken, as those of one wall; take another photo between {from} and {to} that also shows something near"
             ),
-            (None, _) => format!(
-                "{}: shares nothing with the scene or with photos that do; take photos on the way from the scene to it, \
-                 each overlapping the one before by more than half",
-                self.photo
-            ),
+            (None, _) => "nothing is shared with the scene or with photos that share something with it; take photos on the \
+                          way from the scene, each overlapping the one before by more than half"
+                .to_owned(),
             (Some(link @ Link { from: None, .. }), _) => format!(
-                "{}: its weakest link is the one to the scene: {}; take a photo nearer to the panoramas than {}, \
-                 towards the same surfaces",
-                self.photo,
+                "the weakest link is the one to the scene: {}; take a photo nearer to the panoramas than {}, towards the \
+                 same surfaces",
                 link.sentence(),
                 link.to
             ),
             (Some(link @ Link { from: Some(from), .. }), _) => format!(
-                "{}: its weakest link: {}; take another photo between {from} and {}",
-                self.photo,
+                "the weakest link: {}; take another photo between {from} and {}",
                 link.sentence(),
                 link.to
             ),
         }
     }
+}
+
+/// What to do about photos that are not localized well: each advice once, with all photos that it is for.
+pub(crate) fn advice_about<'p>(paths: impl Iterator<Item = &'p PathToScene>) -> Vec<String> {
+    let mut remedies: Vec<(String, Vec<&str>)> = Vec::new();
+    for path in paths {
+        let remedy = path.remedy();
+        match remedies.iter_mut().find(|(other, _)| *other == remedy) {
+            Some((_, photos)) => photos.push(&path.photo),
+            None => remedies.push((remedy, vec![&path.photo])),
+        }
+    }
+    remedies
+        .into_iter()
+        .map(|(remedy, photos)| format!("{}: {remedy}", listed(&photos, MOST_NAMED)))
+        .collect()
 }
 
 /// Widest paths (maximum bottleneck) from the scene to every photo.
@@ -206,15 +222,18 @@ mod tests {
         ];
         name_open_pairs(&mut paths, &BTreeMap::from([((2, 4), 60)]), &open, 12);
         assert!(paths[2].advice().contains("b and c share 90 matches, which do not tell how far"));
-        assert!(paths[4].advice().starts_with("e: its weakest link: b and c share 90 matches"));
-        assert!(paths[3].advice().starts_with("d: its weakest link: c and d share 70 matches"));
+        assert!(paths[4].advice().starts_with("e: the weakest link: b and c share 90 matches"));
+        assert!(paths[3].advice().starts_with("d: the weakest link: c and d share 70 matches"));
         assert!([0, 1].iter().all(|&at| paths[at].open.is_none()));
+        let about = advice_about(paths[2..].iter());
+        assert_eq!(about.len(), 2, "{about:?}");
+        assert!(about[0].starts_with("c, e: the weakest link: b and c share 90 matches"), "{about:?}");
     }
 
     #[test]
     fn an_unconnected_photo_has_no_path() {
         let paths = widest_paths(&["a", "b"], &[30, 0], &BTreeMap::new());
         assert!(paths[1].links.is_empty() && paths[1].weakest().is_none());
-        assert!(paths[1].advice().starts_with("b: shares nothing"));
+        assert!(paths[1].advice().starts_with("b: nothing is shared"));
     }
 }

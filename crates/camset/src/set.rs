@@ -13,7 +13,7 @@ use setloc_sfm::{
     CameraId, ImageId, OutvotedPair, Reconstruction, ReconstructionImage, Rigid, doubtful_images,
 };
 
-use crate::advice::{Link, name_open_pairs, widest_paths};
+use crate::advice::{Link, advice_about, name_open_pairs, widest_paths};
 use crate::{
     CamsetParams, LocalModels, PhotoEvidence, PhotoLocalization, PlacedModel, QueryPhoto, Scene,
     SetLocalization, Verdict, Views, verdict::standard_deviations,
@@ -100,11 +100,9 @@ impl Answer {
         let is_localized = |photo: &usize| set.refined[*photo].verdict == Verdict::Localized;
         let holds = |remark: &Remark| !(remark.is_refusal && remark.members.iter().all(is_localized));
         set.advice = remarks.into_iter().filter(holds).map(|remark| remark.text).collect();
-        for (photo, path) in set.refined.iter().zip(&set.paths) {
-            if photo.verdict != Verdict::Localized {
-                set.advice.push(path.advice());
-            }
-        }
+        let photos = set.refined.iter().zip(&set.paths);
+        let not_localized = photos.filter(|(photo, _)| photo.verdict != Verdict::Localized);
+        set.advice.extend(advice_about(not_localized.map(|(_, path)| path)));
         let contradicted = set.refined.iter().zip(elsewhere).filter(|(_, elsewhere)| *elsewhere);
         set.contradicted = contradicted.map(|(photo, _)| photo.name.clone()).collect();
         set

@@ -238,7 +238,8 @@ mod tests {
         assert_eq!(asked.get(), 2);
         assert!(found.refined.iter().all(|photo| photo.verdict == Verdict::NotLocalized));
         assert!(found.placed.is_empty());
-        let of_photos = found.advice.iter().filter(|text| text.contains("take ")).count();
-        assert_eq!(of_photos, 5, "{:?}", found.advice);
+        let of_photos: Vec<&String> = found.advice.iter().filter(|text| text.contains("take ")).collect();
+        let [advice] = of_photos[..] else { panic!("{:?}", found.advice) };
+        assert!(found.refined.iter().all(|photo| advice.contains(&photo.name)), "{advice}");
     }
 }
