@@ -43,12 +43,7 @@ impl PathToScene {
         self.links.iter().min_by_key(|link| link.shared)
     }
 
-    /// What to do about a photo that is not localized well.
-    pub fn advice(&self) -> String {
-        format!("{}: {}", self.photo, self.remedy())
-    }
-
-    /// The same without the photo's name: photos beyond one weak link have it in common.
+    /// What to do about a photo that is not localized well; photos beyond one weak link have it in common.
     fn remedy(&self) -> String {
         match (self.weakest(), &self.open) {
             (_, Some(Link { from: Some(from), to, shared })) => format!(
@@ -185,6 +180,10 @@ mod tests {
 
     use super::*;
 
+    fn advice(path: &PathToScene) -> String {
+        advice_about(std::iter::once(path)).concat()
+    }
+
     #[test]
     fn the_widest_path_avoids_the_weak_short_cut() {
         let links = BTreeMap::from([((0, 1), 200), ((1, 2), 40), ((0, 2), 9)]);
@@ -192,9 +191,9 @@ mod tests {
         let target = &paths[2];
         assert_eq!(target.links.iter().map(|l| l.to.as_str()).collect::<Vec<_>>(), ["a", "b", "c"]);
         assert_eq!(target.weakest().unwrap().shared, 40);
-        assert!(target.advice().contains("between b and c"), "{}", target.advice());
+        assert!(advice(target).contains("between b and c"), "{}", advice(target));
         assert_eq!(paths[0].links.len(), 1);
-        assert!(paths[0].advice().contains("150 scene points"));
+        assert!(advice(&paths[0]).contains("150 scene points"));
     }
 
     #[test]
@@ -221,9 +220,9 @@ mod tests {
             pair(3, 0, 30),
         ];
         name_open_pairs(&mut paths, &BTreeMap::from([((2, 4), 60)]), &open, 12);
-        assert!(paths[2].advice().contains("b and c share 90 matches, which do not tell how far"));
-        assert!(paths[4].advice().starts_with("e: the weakest link: b and c share 90 matches"));
-        assert!(paths[3].advice().starts_with("d: the weakest link: c and d share 70 matches"));
+        assert!(advice(&paths[2]).contains("b and c share 90 matches, which do not tell how far"));
+        assert!(advice(&paths[4]).starts_with("e: the weakest link: b and c share 90 matches"));
+        assert!(advice(&paths[3]).starts_with("d: the weakest link: c and d share 70 matches"));
         assert!([0, 1].iter().all(|&at| paths[at].open.is_none()));
         let about = advice_about(paths[2..].iter());
         assert_eq!(about.len(), 2, "{about:?}");
@@ -234,6 +233,6 @@ mod tests {
     fn an_unconnected_photo_has_no_path() {
         let paths = widest_paths(&["a", "b"], &[30, 0], &BTreeMap::new());
         assert!(paths[1].links.is_empty() && paths[1].weakest().is_none());
-        assert!(paths[1].advice().starts_with("b: nothing is shared"));
+        assert!(advice(&paths[1]).starts_with("b: nothing is shared"));
     }
 }

@@ -168,6 +168,20 @@ pub(super) fn search<K, const ROWS: usize, const LANES: usize>(
     }
 }
 
+/// The lanes in which any of these is less than a bound.
+#[inline(always)]
+fn any_less<L: Lanes<LANES>, const N: usize, const LANES: usize>(
+    lanes: L,
+    distances: [L::Vector; N],
+    bound: L::Vector,
+) -> L::Mask {
+    let mut any = lanes.less(distances[0], bound);
+    for at in 1..N {
+        any = lanes.or(any, lanes.less(distances[at], bound));
+    }
+    any
+}
+
 /// The nearest two of one vector of rows or columns, each lane by itself and without a branch, as many of them change often.
 #[derive(Clone, Copy)]
 struct LaneTwo<const LANES: usize> {
@@ -183,12 +197,7 @@ impl<const LANES: usize> LaneTwo<LANES> {
     /// Whether any of these is one of the nearest two of its lane.
     #[inline(always)]
     fn is_any_nearer<L: Lanes<LANES>, const N: usize>(&self, lanes: L, distances: [L::Vector; N]) -> bool {
-        let second = lanes.load(&self.second);
-        let mut any = lanes.less(distances[0], second);
-        for at in 1..N {
-            any = lanes.or(any, lanes.less(distances[at], second));
-        }
-        lanes.bits(any) != 0
+        lanes.bits(any_less(lanes, distances, lanes.load(&self.second))) != 0
     }
 
     /// Takes vectors of distances, each with what stands for it, in this order.
@@ -292,15 +301,18 @@ impl<const LANES: usize> Sink<LANES> for TwoOfColumns<LANES> {
         let columns: &mut [LaneTwo<LANES>; VECTORS] =
             self.0[column / LANES..].first_chunk_mut().expect("a full tile of base descriptors");
         for vector in 0..VECTORS {
-            let mut of_vector = [lanes.splat(0); ROWS];
-            let mut rows = of_vector;
-            for offset in 0..ROWS {
+            let mut of_vector = [distances[0][vector]; ROWS];
+            for offset in 1..ROWS {
                 of_vector[offset] = distances[offset][vector];
+            }
+            if !columns[vector].is_any_nearer(lanes, of_vector) {
+                continue;
+            }
+            let mut rows = [lanes.splat(row as i32); ROWS];
+            for offset in 1..ROWS {
                 rows[offset] = lanes.splat((row + offset) as i32);
             }
-            if columns[vector].is_any_nearer(lanes, of_vector) {
-                columns[vector].take(lanes, of_vector, rows);
-            }
+            columns[vector].take(lanes, of_vector, rows);
         }
     }
 }
@@ -323,16 +335,12 @@ impl<const LANES: usize> Sink<LANES> for Offers<'_> {
         column: usize,
     ) {
         let bounds: &[i32; ROWS] = self.bounds[row..].first_chunk().expect("a full tile of queries");
-        let mut any = None;
-        for offset in 0..ROWS {
-            let bound = lanes.splat(bounds[offset]);
-            for vector in 0..VECTORS {
-                let near = lanes.less(distances[offset][vector], bound);
-                any = Some(any.map_or(near, |any| lanes.or(any, near)));
-            }
+        let mut any = any_less(lanes, distances[0], lanes.splat(bounds[0]));
+        for offset in 1..ROWS {
+            any = lanes.or(any, any_less(lanes, distances[offset], lanes.splat(bounds[offset])));
         }
         // Of most tiles nothing is.
-        if any.is_none_or(|any| lanes.bits(any) == 0) {
+        if lanes.bits(any) == 0 {
             return;
         }
         for offset in 0..ROWS {

@@ -79,8 +79,10 @@ impl ImagePyramid {
         split(Level::detect(), columns, rows, width as i32, offsets);
         if inside {
             let first = origin[1] * width + origin[0];
-            corners
-                .extend(offsets.iter().map(|&offset| level.corners_at((first + offset as isize) as usize)));
+            corners.extend(offsets.iter().map(|&offset| {
+                let at = (first + offset as isize) as usize;
+                level.corners([at, at + 1])
+            }));
         }
         values.resize(corners.len(), 0.0);
         interpolate(Level::detect(), corners, columns, rows, values);
@@ -138,14 +140,6 @@ impl GreyImage {
         [values[left], values[right], values[left + self.width], values[right + self.width]]
     }
 
-    /// A pixel, the one beside it, and those below them.
-    #[inline]
-    fn corners_at(&self, at: usize) -> [u8; 4] {
-        let two = |at: usize| *self.values[at..].first_chunk::<2>().expect("two pixels of a row");
-        let ([a, b], [c, d]) = (two(at), two(at + self.width));
-        [a, b, c, d]
-    }
-
     /// Half the size, each pixel from 4 × 4 by the weights (1, 3, 3, 1)/8: its centre is that of the 2 × 2 it stands for.
     fn halved(&self, wraps_around: bool) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
@@ -178,20 +172,9 @@ vectorized! {
             let constant = axis.constant + y * (axis.linear[1] + y * axis.square[1]);
             let constant = (scale * constant - 0.5 - origin) as f32;
             let linear = (scale * (axis.linear[0] + y * axis.mixed)) as f32;
-            // Blocks of one size fill a register each; a loop over a row is too short for what compilers make of it.
-            let (blocks, rest) = row.as_chunks_mut::<8>();
-            let mut from = -radius;
-            for block in blocks {
-                for (place, lane) in block.iter_mut().zip(0..) {
-                    let x = (from + lane) as f32;
-                    *place = constant + x * (linear + x * square);
-                }
-                from += 8;
-            }
-            for place in rest {
-                let x = from as f32;
+            for (x, place) in (-radius..).zip(row) {
+                let x = x as f32;
                 *place = constant + x * (linear + x * square);
-                from += 1;
             }
         }
     }
