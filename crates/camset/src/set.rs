@@ -191,7 +191,7 @@ fn locate_by(
                 for pair in outvoted {
                     doubt_beyond(pair, photos, evidence, &members, &mut found);
                 }
-                let doubtful = doubtful_images(model, outvoted);
+                let doubtful = doubtful_images(model, outvoted, &[]);
                 doubt_folded(&doubtful, params.verdict.min_inliers, evidence, &members, &mut found);
                 let (component, world_from_set) = (scene.component, found.world_from_set);
                 answer.placed.push(PlacedModel { component, world_from_set });

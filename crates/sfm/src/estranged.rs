@@ -86,7 +86,7 @@ mod tests {
         let strangers = found(1, &[pair(1, 3, 140), pair(0, 3, 336), pair(3, 4, 90)]);
         let [stranger] = &strangers[..] else { panic!("{strangers:?}") };
         assert_eq!((stranger.first, stranger.second, stranger.held_by), (ImageId(3), ImageId(0), 78));
-        assert_eq!(doubtful_images(&components[1], &strangers), [3, 4].map(ImageId));
+        assert_eq!(doubtful_images(&components[1], &strangers, &[]), [3, 4].map(ImageId));
         let sentences =
             QualityReport { outvoted: strangers, ..QualityReport::default() }.sentences(&components[1]);
         assert!(

@@ -101,7 +101,7 @@ impl TwoNearest {
         Self { index: Self::NO_INDEX, distance2: Self::NO_DISTANCE, second_distance2: Self::NO_DISTANCE };
 
     /// Takes the nearest two of both; at equal distance `self` wins, so merge in ascending index order.
-    pub fn merge(&mut self, other: &Self) {
+    pub(super) fn merge(&mut self, other: &Self) {
         if other.distance2 < self.distance2 {
             self.second_distance2 = self.distance2.min(other.second_distance2);
             self.distance2 = other.distance2;
@@ -268,17 +268,14 @@ impl PackedQueries {
     }
 }
 
-/// Descriptors packed once for many searches, as the lists of an inverted index are.
+/// Descriptors packed once for many searches, as the centroids of an inverted index are.
 ///
 /// ```
 /// use setloc_features::{DESCRIPTOR_LEN, DescriptorBlock, TwoNearest};
 ///
-/// let list = DescriptorBlock::new(&[vec![10; DESCRIPTOR_LEN], vec![20; DESCRIPTOR_LEN]].concat());
-/// let query = vec![11; DESCRIPTOR_LEN];
-/// // This list's descriptors are numbers 500 and 501 of the whole index.
-/// let mut nearest = [TwoNearest::NONE];
-/// list.update(&query, 500, &mut nearest);
-/// assert_eq!(nearest[0], TwoNearest { index: 500, distance2: 128, second_distance2: 128 * 81 });
+/// let block = DescriptorBlock::new(&[vec![10; DESCRIPTOR_LEN], vec![20; DESCRIPTOR_LEN]].concat());
+/// let nearest = block.two_nearest(&[11; DESCRIPTOR_LEN]);
+/// assert_eq!(nearest, [TwoNearest { index: 0, distance2: 128, second_distance2: 128 * 81 }]);
 /// ```
 pub struct DescriptorBlock {
     kernel: Kernel,
@@ -306,32 +303,9 @@ impl DescriptorBlock {
         Self { kernel, len: count(descriptors), base: kernel.pack_base(descriptors) }
     }
 
-    /// Number of descriptors.
-    pub fn len(&self) -> usize {
-        self.len
-    }
-
-    /// Whether the block has no descriptors.
-    pub fn is_empty(&self) -> bool {
-        self.len == 0
-    }
-
     /// The nearest two of each query (row-major, `n × DESCRIPTOR_LEN` bytes), indices counted within the block.
     pub fn two_nearest(&self, queries: &[u8]) -> Vec<TwoNearest> {
         self.search(queries, All, false).0
-    }
-
-    /// Merges the nearest two of each query into `nearest`, with this block's descriptors numbered from `first_index`.
-    ///
-    /// Give blocks in ascending order of `first_index` for ties to go to the lowest index. `nearest` beyond the
-    /// number of queries is left alone.
-    pub fn update(&self, queries: &[u8], first_index: u32, nearest: &mut [TwoNearest]) {
-        for (slot, mut found) in nearest.iter_mut().zip(self.two_nearest(queries)) {
-            if found.index != TwoNearest::NO_INDEX {
-                found.index += first_index;
-            }
-            slot.merge(&found);
-        }
     }
 
     fn search(
@@ -584,19 +558,5 @@ mod tests {
             let found = DescriptorBlock::with_kernel(kernel, &base).search(&queries, &compared, true);
             assert_eq!(found, expected, "{kernel:?}");
         }
-    }
-
-    #[test]
-    fn merging_blocks_equals_searching_the_whole() {
-        let mut rng = ChaCha8Rng::seed_from_u64(5);
-        let mut random = |count: usize| -> Vec<u8> {
-            (0..count * DESCRIPTOR_LEN).map(|_| rng.random_range(0..=3)).collect()
-        };
-        let (queries, base) = (random(20), random(100));
-        let mut merged = vec![TwoNearest::NONE; 20];
-        let (head, tail) = base.split_at(37 * DESCRIPTOR_LEN);
-        DescriptorBlock::new(head).update(&queries, 0, &mut merged);
-        DescriptorBlock::new(tail).update(&queries, 37, &mut merged);
-        assert_eq!(merged, two_nearest(&queries, &base));
     }
 }

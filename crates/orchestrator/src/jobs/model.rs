@@ -250,6 +250,7 @@ fn run_model(
         let report = assess(quality, component, larger, &pairs);
         output.report.warnings.extend(report.sentences(component));
         output.outvoted.push(report.outvoted);
+        output.suspicious.push(report.suspicious);
         output.report.georegistrations.push(input.measured.place(component));
         output.report.warnings.extend(apart(at, component, &output.report.georegistrations));
     }

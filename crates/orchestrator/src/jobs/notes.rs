@@ -2,7 +2,8 @@
 
 use setloc_index::SceneIndex;
 use setloc_sfm::{
-    ImageId, ModelErrors, OutvotedPair, Reconstruction, UnconfirmedPair, doubtful_images, listed,
+    ImageId, ModelErrors, OutvotedPair, Reconstruction, SuspiciousNeighbours, UnconfirmedPair,
+    doubtful_images, listed,
 };
 
 /// Which component a note is of, unless it is the largest.
@@ -62,11 +63,15 @@ pub(super) enum Doubt {
 }
 
 impl Doubt {
-    /// Of a component with the pairs that outvote it.
-    pub fn of(component: &Reconstruction, outvoted: &[OutvotedPair]) -> Self {
+    /// Of a component with the pairs that outvote it and those that stand together and share nothing.
+    pub fn of(
+        component: &Reconstruction,
+        outvoted: &[OutvotedPair],
+        suspicious: &[SuspiciousNeighbours],
+    ) -> Self {
         match UnconfirmedPair::of(component) {
             Some(pair) => Self::Unconfirmed(pair),
-            None => Self::Folded(doubtful_images(component, outvoted)),
+            None => Self::Folded(doubtful_images(component, outvoted, suspicious)),
         }
     }
 

@@ -58,8 +58,9 @@ impl SceneRecipe {
         let origin = self.origin.filter(|_| placed.first() == Some(&true));
         let origin =
             origin.map(|at| if self.has_altitudes() { at } else { Wgs84 { alt: NO_ALTITUDE, ..at } });
-        let doubts: Vec<Doubt> = (output.components.iter().zip(&output.outvoted))
-            .map(|(component, outvoted)| Doubt::of(component, outvoted))
+        let doubts: Vec<Doubt> = (output.components.iter())
+            .zip(output.outvoted.iter().zip(&output.suspicious))
+            .map(|(component, (outvoted, suspicious))| Doubt::of(component, outvoted, suspicious))
             .collect();
         let errors: Vec<Option<ModelErrors>> = (output.components.iter())
             .zip(&output.report.georegistrations)

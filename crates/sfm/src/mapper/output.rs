@@ -3,7 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::{MergeRecord, register::Visibility};
-use crate::{CameraId, Georegistration, ImageId, OutvotedPair, PairGeometry, Reconstruction};
+use crate::{
+    CameraId, Georegistration, ImageId, OutvotedPair, PairGeometry, Reconstruction, SuspiciousNeighbours,
+};
 
 /// How one image entered the model, or why it did not.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -73,6 +75,8 @@ pub struct MapperOutput {
     pub open_pairs: Vec<PairGeometry>,
     /// Pairs that weigh against what holds each component together there; none is known of components beyond the end.
     pub outvoted: Vec<Vec<OutvotedPair>>,
+    /// Images of each component that stand together and share nothing; none is known of components beyond the end.
+    pub suspicious: Vec<Vec<SuspiciousNeighbours>>,
     /// What happened.
     pub report: MapperReport,
 }
