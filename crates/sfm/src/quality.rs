@@ -19,7 +19,7 @@ use crate::{
 pub struct QualityParams {
     /// Rotation between a verified pair and the final poses that counts as disagreement, in degrees.
     pub max_rotation_deg: f64,
-    /// Share of points in plain view of two cameras that they must both see. In right models of real tours and rendered towns
+    /// Share of points in plain view of two cameras that they must both see. In right models of real tours and rendered streets
     /// no two share less than 0.20 (one room by day and by night 0.75), in folded floors many less than 0.1.
     pub min_shared_view: f64,
     /// Points in plain view below which nothing is concluded.
