@@ -555,7 +555,8 @@ fn chain_that_conjugate_gradients_do_not_finish_is_counted() {
     let mut problem = streets(1, 300, 0, 38);
     problem.position_priors.clear();
     perturb(&mut problem, 0.01, 39);
-    let params = BundleParams { linear_solver: LinearSolver::Iterative, ..BundleParams::default() };
+    let linear_solver = LinearSolver::Iterative;
+    let params = BundleParams { linear_solver, max_iterations: 5, ..BundleParams::default() };
     let report = solve(&params, &mut problem);
     assert!(report.truncated_steps > 0 && report.final_cost.is_finite(), "{report:?}");
 }
