@@ -25,7 +25,7 @@ pub use ray_homography::{RayHomographyEstimate, estimate_ray_homography};
 pub use relative_pose::{
     RelativePoseEstimate, RotationEstimate, estimate_relative_pose, estimate_rotation, refine_relative_pose,
 };
-pub(crate) use relative_pose::{estimate_level_pose, estimate_turned_pose};
+pub(crate) use relative_pose::{estimate_level_pose, estimate_turned_pose, misfit_of_rotation};
 pub use residual::AngularResidual;
 pub use turned_camera::{TurnedCamera, estimate_turned_camera};
 

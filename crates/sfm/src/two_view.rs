@@ -8,11 +8,12 @@ use crate::{
     ImageId, Rigid,
     robust::{
         RansacParams, estimate_level_pose, estimate_relative_pose, estimate_rotation, estimate_turned_pose,
+        misfit_of_rotation,
     },
 };
 
 /// Bumped when equal inputs and parameters give another geometry.
-pub const TWO_VIEW_VERSION: u32 = 4;
+pub const TWO_VIEW_VERSION: u32 = 5;
 
 /// How to verify a pair.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -29,6 +30,10 @@ pub struct TwoViewParams {
     /// Where a rotation explains most of the inliers: the share of the matches it leaves over that a baseline must
     /// explain for the pair not to count as a rotation. Chance alone reaches a tenth.
     pub min_baseline_share: f64,
+    /// How many times farther off than a baseline a rotation may leave the matches that both explain and still count as one.
+    ///
+    /// A long lens sees something small: from the next standpoint it looks turned, to within what keypoints are said to be off.
+    pub max_rotation_misfit: f64,
     /// Most samples of five drawn for one geometry; below a third of inliers a pair is worth little to the mapper.
     pub max_iterations: u32,
     /// Most samples of three drawn before for one geometry of two panoramas, which stand about upright.
@@ -49,6 +54,7 @@ impl Default for TwoViewParams {
             min_parallax_deg: 0.5,
             rotation_share: 0.8,
             min_baseline_share: 0.2,
+            max_rotation_misfit: 3.0,
             max_iterations: 2500,
             max_upright_iterations: 1000,
             max_tilted_iterations: 1000,
@@ -57,6 +63,9 @@ impl Default for TwoViewParams {
         }
     }
 }
+
+/// Share of the inliers that a rotation must explain where a baseline explains next to nothing of what it leaves over.
+const LEAST_ROTATION_SHARE: f64 = 0.7;
 
 /// What relates the two views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -159,6 +168,9 @@ pub fn verify_pair(
         }
         remaining.retain(|m| view.inliers.binary_search(m).is_err());
         found.push(view);
+        if (remaining.len() as f64) < params.min_runner_up_share * found[0].inliers.len() as f64 {
+            break;
+        }
     }
     found
 }
@@ -206,17 +218,22 @@ fn verify_once(
         confidence: 0.999,
         ..RansacParams::default()
     };
+    // What fewer agree on is not taken.
+    let (least, count) = (params.min_inliers as f64, matches.len());
     let (bearings, sigmas) = ((&first_bearings, &second_bearings), (&first_sigmas, &second_sigmas));
     let estimate = match attitude {
         Attitude::Turned(turn) => {
+            let ransac = ransac.enough_for(least, count, 2)?;
             estimate_turned_pose(&ransac, bearings.0, bearings.1, sigmas.0, sigmas.1, turn, seed)?
         }
         Attitude::Held(Posture::Level(_)) => {
-            let tilted = RansacParams { max_iterations: params.max_tilted_iterations, ..ransac.clone() };
-            let upright = params.max_upright_iterations;
+            let of = |max_iterations| RansacParams { max_iterations, ..ransac.clone() };
+            let upright = of(params.max_upright_iterations).enough_for(least, count, 3)?.max_iterations;
+            let tilted = of(params.max_tilted_iterations).enough_for(least, count, 5)?;
             estimate_level_pose(&tilted, upright, bearings.0, bearings.1, sigmas.0, sigmas.1, seed)?
         }
         Attitude::Held(Posture::Any) => {
+            let ransac = ransac.enough_for(least, count, 5)?;
             estimate_relative_pose(&ransac, bearings.0, bearings.1, sigmas.0, sigmas.1, seed)?
         }
     };
@@ -231,14 +248,33 @@ fn verify_once(
         .collect();
     let middle = parallaxes.len() / 2;
     let median_parallax_rad = *parallaxes.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let turn =
-        estimate_rotation(&ransac, &first_bearings, &second_bearings, &first_sigmas, &second_sigmas, seed);
+    // A turn that explains less of the inliers is none.
+    let least = LEAST_ROTATION_SHARE.min(params.rotation_share) * estimate.inliers.len() as f64;
+    let turn = estimate_rotation(
+        &ransac.enough_for(least, count, 2)?,
+        &first_bearings,
+        &second_bearings,
+        &first_sigmas,
+        &second_sigmas,
+        seed,
+    );
     let is_turn = turn.as_ref().is_some_and(|turn| {
         let (turned, explained) = (turn.inliers.len() as f64, estimate.inliers.len() as f64);
         // What a baseline explains beyond the turn, and what is left for it to explain.
         let (gained, left) = (explained - turned, matches.len() as f64 - turned);
-        turned >= params.rotation_share * explained
-            || (turned >= 0.7 * explained && gained < params.min_baseline_share * left)
+        let explains_as_many = turned >= params.rotation_share * explained
+            || (turned >= LEAST_ROTATION_SHARE * explained && gained < params.min_baseline_share * left);
+        explains_as_many && {
+            let both: Vec<u32> = estimate
+                .inliers
+                .iter()
+                .filter(|at| turn.inliers.binary_search(at).is_ok())
+                .copied()
+                .collect();
+            let (pose, rotation) = (&estimate.second_from_first, &turn.second_from_first);
+            misfit_of_rotation((bearings.0, bearings.1), (sigmas.0, sigmas.1), &both, pose, rotation)
+                <= params.max_rotation_misfit.powi(2)
+        }
     });
     let mut second_from_first = estimate.second_from_first;
     let mut inliers = estimate.inliers;
@@ -256,4 +292,41 @@ fn verify_once(
         inliers,
         median_parallax_rad,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::Rng;
+
+    use super::*;
+    use crate::synthetic::{normal, seeded};
+
+    /// The kind of two views, turned by 5°, of something of a tenth of its distance: from two standpoints, or turned on the spot.
+    /// Keypoints are off by a quarter of what they are said to be.
+    fn kind(steps_aside: bool) -> TwoViewKind {
+        const SIGMA: f64 = 8e-4;
+        let mut rng = seeded("small");
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.08);
+        // The second turns about what it sees where it steps aside, else on the spot.
+        let aside = if steps_aside { Vector3::z() - turn * Vector3::z() } else { Vector3::zeros() };
+        let (mut first, mut second) = (Rays::default(), Rays::default());
+        for _ in 0..300 {
+            let mut within = |size: f64| rng.random_range(-size..size);
+            let point = Vector3::new(within(0.1), within(0.1), 1.0 + within(0.06));
+            for (rays, seen) in [(&mut first, point), (&mut second, turn * point + aside)] {
+                let noise = Vector3::new(normal(&mut rng), normal(&mut rng), 0.0) * (SIGMA / 4.0);
+                rays.bearings.push((seen.normalize() + noise).normalize());
+                rays.sigmas.push(SIGMA);
+            }
+        }
+        let matches: Vec<Match> = (0..300).map(|at| Match { first: at, second: at }).collect();
+        let found = verify_pair(&TwoViewParams::default(), Posture::Any, &first, &second, &matches, 3);
+        found[0].kind
+    }
+
+    #[test]
+    fn what_is_small_and_far_looks_turned_from_the_next_standpoint_and_is_not() {
+        assert_eq!(kind(true), TwoViewKind::General);
+        assert_eq!(kind(false), TwoViewKind::PureRotation);
+    }
 }

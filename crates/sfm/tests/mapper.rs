@@ -486,6 +486,32 @@ fn photos_turned_on_the_spot_are_mapped_as_one_standpoint() {
 }
 
 #[test]
+fn photos_that_show_the_same_from_one_standpoint_have_points_in_common() {
+    // Along one side of the street, each view twice, the second turned by a fifth of a degree.
+    let camera = Camera::from_focal_guess(1600, 1200, 800.0);
+    let views = (0..12).map(|k| {
+        let yaw = std::f64::consts::FRAC_PI_2 + 0.2_f64.to_radians() * f64::from(k % 2);
+        let center =
+            Vector3::new(-2.0 + f64::from(k / 2 % 2), 0.1 * f64::from(k / 4), f64::from(k / 2) * 4.0);
+        (camera.clone(), Rigid::new(UnitQuaternion::from_axis_angle(&Vector3::y_axis(), yaw), center))
+    });
+    let street = Street::new(views.collect(), 0.3, 0, 11);
+    let output = street.map(&street.cameras, Calibration::Known);
+    let (registered, worst_m, _) = street.errors(&output);
+    assert_eq!(registered, 12, "{:?}", output.report.registrations);
+    assert!(worst_m < 0.05, "{worst_m} m");
+    let (mut seen, mut by_both) = (0, 0);
+    for point in &output.components[0].points {
+        for of in &point.track {
+            seen += 1;
+            by_both +=
+                usize::from(point.track.iter().any(|other| other.image.index() == of.image.index() ^ 1));
+        }
+    }
+    assert!(by_both * 4 > seen * 3, "{by_both} of {seen}");
+}
+
+#[test]
 fn two_streets_without_a_common_view_are_two_components() {
     let mut street = Street::of_panoramas(10, 0.3, 0, 6);
     for image in 5..10 {

@@ -78,6 +78,7 @@ const RANGES: &[(&str, Range)] = &[
     ("two_view.max_iterations", Range::Within(50.0, 1e9)),
     ("two_view.max_upright_iterations", Range::Within(50.0, 1e9)),
     ("two_view.max_tilted_iterations", Range::Within(50.0, 1e9)),
+    ("two_view.max_rotation_misfit", Range::From(1.0)),
     ("two_view.max_geometries", Range::From(1.0)),
     ("max_error_sigma", Range::Positive),
     ("max_error_sigmas", Range::Positive),

@@ -58,20 +58,24 @@ pub(super) fn calibrate(
         Some((source.features.keypoints.get(feature as usize)?, model.point(id)?.position))
     });
     let (keypoints, points): (Vec<&Keypoint>, Vec<Vector3<f64>>) = found.unzip();
-    let seen = Seen { keypoints, points, max_error_sigma: params.max_error_sigma };
-    let (camera, agreeing) = seen.calibrated(guess, params, seed)?;
     let by_guess = hypothesize(model, graph, image, params, 1, seed);
     let by_guess = by_guess.first().map_or(0, |hypothesis| hypothesis.inliers.len());
-    (agreeing >= MIN_AGREEING && agreeing as f64 >= GAIN * by_guess as f64).then_some(camera)
+    let least = (GAIN * by_guess as f64).max(MIN_AGREEING as f64);
+    let seen = Seen { keypoints, points, max_error_sigma: params.max_error_sigma };
+    let params = params.enough_for(least, seen.points.len(), 4)?;
+    let (camera, agreeing) = seen.calibrated(guess, &params, seed)?;
+    (agreeing as f64 >= least).then_some(camera)
 }
 
 impl Seen<'_> {
     /// The camera and how many matches agree with it: a fisheye, where that explains clearly more.
     fn calibrated(&self, guess: &Camera, params: &RansacParams, seed: u64) -> Option<(Camera, usize)> {
         let usual = self.rectilinear(guess, params, seed);
-        let fisheye = self.fisheye(guess, params, seed);
-        let support = |found: &Option<(_, usize)>| found.as_ref().map_or(0, |(_, agreeing)| *agreeing);
-        if support(&fisheye) as f64 > FISHEYE_GAIN * support(&usual) as f64 { fisheye } else { usual }
+        let least = FISHEYE_GAIN * usual.as_ref().map_or(0, |(_, agreeing)| *agreeing) as f64;
+        let fisheye = (params.enough_for(least, self.points.len(), 3))
+            .and_then(|params| self.fisheye(guess, &params, seed))
+            .filter(|(_, agreeing)| *agreeing as f64 > least);
+        fisheye.or(usual)
     }
 
     /// A camera by focal length and pose in one.

@@ -394,20 +394,29 @@ fn is_mere_turn(params: &MapperParams, pair: &PairGeometry, rays: &[Rays]) -> bo
     agreeing * 10 >= pair.two_view.inliers.len() * 9
 }
 
-/// Whether enough of what both photos ought to see after the turn was matched.
+/// Whether enough of what both photos ought to see after the turn was matched, and either shows something else, too.
 ///
-/// Photos of two places that look alike match as after a turn, too, but only in what looks alike.
+/// Photos of two places that look alike match as after a turn, too, but only in what looks alike. A photo of nothing but what the
+/// other shows adds nothing to a mosaic, and there one of the two would be left with next to no points: each is resected by itself.
 fn sees_the_overlap(
     params: &MapperParams,
     input: &MapperInput<'_>,
     pair: &PairGeometry,
     rays: &[Rays],
 ) -> bool {
-    let first = &input.images[pair.first.index()];
-    let second = input.camera_of(pair.second);
-    let bearings = &rays[pair.first.index()].bearings;
     let turn = pair.two_view.second_from_first.rotation;
-    let shared =
-        (0..first.features.own_len()).filter(|&at| is_in_image(second, &(turn * bearings[at]))).count();
-    pair.two_view.inliers.len() as f64 >= params.min_turn_recall * shared as f64
+    let shared = |from: ImageId, to: ImageId, turn: UnitQuaternion<f64>| {
+        let bearings = &rays[from.index()].bearings[..input.images[from.index()].features.own_len()];
+        let camera = input.camera_of(to);
+        let shared = bearings.iter().filter(|bearing| is_in_image(camera, &(turn * *bearing))).count();
+        (shared, shared as f64 <= MAX_COMMON_SHARE * bearings.len() as f64)
+    };
+    let (ahead, first_shows_more) = shared(pair.first, pair.second, turn);
+    let (_, second_shows_more) = shared(pair.second, pair.first, turn.inverse());
+    first_shows_more
+        && second_shows_more
+        && pair.two_view.inliers.len() as f64 >= params.min_turn_recall * ahead as f64
 }
+
+/// Share of a photo's keypoints above which another of its standpoint shows all that it does.
+const MAX_COMMON_SHARE: f64 = 0.9;

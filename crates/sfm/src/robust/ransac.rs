@@ -70,6 +70,18 @@ impl RansacParams {
     }
 }
 
+impl RansacParams {
+    /// The same with no more samples than find what `supporting` of so many data support; at most as many as now. `None` where
+    /// there are fewer.
+    ///
+    /// Twice as many as find one sample without outliers: a noisy one may support less.
+    pub(crate) fn enough_for(&self, supporting: f64, count: usize, sample_size: usize) -> Option<Self> {
+        let samples = stopping_iteration(self, supporting / count as f64, sample_size);
+        let max_iterations = samples.saturating_mul(2).min(self.max_iterations);
+        (supporting <= count as f64).then(|| Self { max_iterations, ..self.clone() })
+    }
+}
+
 /// What LO-RANSAC needs to know of a problem.
 pub(super) trait Consensus {
     /// What is estimated, in the form that scores fastest.
@@ -278,5 +290,15 @@ mod tests {
         assert_eq!(super::stopping_iteration(&params, 1.0, 4), 1);
         assert_eq!(super::stopping_iteration(&params, 0.4, 4), 356);
         assert_eq!(super::stopping_iteration(&params, 0.0, 4), params.max_iterations);
+    }
+
+    #[test]
+    fn as_many_samples_are_enough_as_find_what_would_be_taken() {
+        let params = RansacParams { min_iterations: 1, ..RansacParams::default() };
+        assert_eq!(params.enough_for(40.0, 100, 4).unwrap().max_iterations, 712);
+        assert_eq!(params.enough_for(0.0, 100, 4), Some(params.clone()));
+        assert_eq!(params.enough_for(101.0, 100, 4), None);
+        let few = RansacParams { max_iterations: 100, ..params };
+        assert_eq!(few.enough_for(40.0, 100, 4), Some(few));
     }
 }

@@ -6,6 +6,7 @@ use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
 use super::ransac::{Consensus, Consented, RansacParams, distinct, lo_ransac, lo_ransac_from, robust_cost};
 use super::residual::AngularResidual;
 use crate::Rigid;
+use crate::mapper::median;
 use crate::solvers::essential::{is_in_front, rotations_of_essential};
 use crate::solvers::{five_point, tangent_basis, upright_three_point};
 
@@ -134,6 +135,51 @@ pub fn estimate_rotation(
         iterations: found.iterations,
     })
 }
+
+/// How much farther off a rotation leaves matches than a relative pose that they agree with, too: the ratio of the variances per
+/// dimension, told by medians.
+///
+/// A rotation has errors in two dimensions, an epipolar line in the one across it. Where there is no baseline both are the noise
+/// of the keypoints, which may be far below the stated one; where there is one, the rotation's are the parallax, too. `matches`
+/// are indices of those that both explain.
+pub(crate) fn misfit_of_rotation(
+    (first, second): (&[Vector3<f64>], &[Vector3<f64>]),
+    (sigmas_first, sigmas_second): (&[f64], &[f64]),
+    matches: &[u32],
+    second_from_first: &Rigid,
+    rotation: &UnitQuaternion<f64>,
+) -> f64 {
+    let params = RansacParams::default();
+    let Some(data) = RelativeMatches::new(&params, first, second, sigmas_first, sigmas_second) else {
+        return 1.0;
+    };
+    let Some(translation) = second_from_first.translation.try_normalize(0.0) else { return 1.0 };
+    let pose = SecondFromFirst {
+        rotation: second_from_first.rotation.to_rotation_matrix().into_inner(),
+        translation,
+    };
+    let turned = rotation.to_rotation_matrix().into_inner();
+    let squared_of_pose = |&index: &u32| {
+        let term = data.sampson(&pose, index as usize);
+        term.error * term.error / term.variance
+    };
+    let squared_of_turn = |&index: &u32| {
+        let (a, b) = data.variances[index as usize];
+        let rotated = turned * first[index as usize];
+        AngularResidual::squared(&second[index as usize], &rotated, 1.0 / (a + b))
+    };
+    let of_pose = median(matches.iter().map(squared_of_pose).collect());
+    let of_turn = median(matches.iter().map(squared_of_turn).collect());
+    let (Some(of_pose), Some(of_turn)) = (of_pose, of_turn) else { return 1.0 };
+    (of_turn / MEDIAN_OF_TWO) / (of_pose / MEDIAN_OF_ONE).max(LEAST_VARIANCE)
+}
+
+/// Median of the square of a standard normal variable, and of the sum of two such.
+const MEDIAN_OF_ONE: f64 = 0.454_936;
+const MEDIAN_OF_TWO: f64 = 2.0 * std::f64::consts::LN_2;
+
+/// Share of the stated variance below which that of keypoints is not told.
+const LEAST_VARIANCE: f64 = 0.01;
 
 /// Rays whose normal is below this many standard deviations are parallel: their depth signs mean nothing.
 const PARALLEL_SIGMA: f64 = 3.0;
