@@ -44,7 +44,6 @@ use rayon::prelude::*;
 
 pub(crate) use self::adjust::{MIN_ADJUSTABLE_POINTS, MIN_CALIBRATING_POINTS};
 pub(crate) use self::corner::ln_false_alarms;
-pub(crate) use self::merge::median;
 pub use self::{
     input::{InputImage, MapperInput, PutativePair},
     merge::{MergeRecord, MergeVerdict, Recognition},

@@ -43,3 +43,10 @@ pub struct GeneralizedRay {
     /// Which camera of the set it belongs to; rays of one camera share their origin.
     pub camera: u32,
 }
+
+/// The upper middle of the finite values.
+pub(crate) fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.retain(|value| value.is_finite());
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}

@@ -8,7 +8,7 @@ use crate::{
     ImageId, Rigid,
     robust::{
         RansacParams, estimate_level_pose, estimate_relative_pose, estimate_rotation, estimate_turned_pose,
-        misfit_of_rotation,
+        median, misfit_of_rotation,
     },
 };
 
@@ -159,18 +159,18 @@ pub fn verify_pair(
     while found.len() < params.max_geometries {
         let attitude = Attitude::Held(posture);
         let seed = seed.wrapping_add(found.len() as u64);
+        let least = found.first().map_or(0.0, |best| params.min_runner_up_share * best.inliers.len() as f64);
+        if (remaining.len() as f64) < least {
+            break;
+        }
         let Some(view) = verify_once(params, first, second, &remaining, attitude, seed) else {
             break;
         };
-        let share = view.inliers.len() as f64 / found.first().map_or(1, |best| best.inliers.len()) as f64;
-        if !found.is_empty() && share < params.min_runner_up_share {
+        if (view.inliers.len() as f64) < least {
             break;
         }
         remaining.retain(|m| view.inliers.binary_search(m).is_err());
         found.push(view);
-        if (remaining.len() as f64) < params.min_runner_up_share * found[0].inliers.len() as f64 {
-            break;
-        }
     }
     found
 }
@@ -241,13 +241,11 @@ fn verify_once(
         return None;
     }
     let rotation = estimate.second_from_first.rotation;
-    let mut parallaxes: Vec<f64> = estimate
+    let parallaxes = estimate
         .inliers
         .iter()
-        .map(|&index| (rotation * first_bearings[index as usize]).angle(&second_bearings[index as usize]))
-        .collect();
-    let middle = parallaxes.len() / 2;
-    let median_parallax_rad = *parallaxes.select_nth_unstable_by(middle, f64::total_cmp).1;
+        .map(|&index| (rotation * first_bearings[index as usize]).angle(&second_bearings[index as usize]));
+    let median_parallax_rad = median(parallaxes.collect())?;
     // A turn that explains less of the inliers is none.
     let least = LEAST_ROTATION_SHARE.min(params.rotation_share) * estimate.inliers.len() as f64;
     let turn = estimate_rotation(
@@ -273,7 +271,7 @@ fn verify_once(
                 .collect();
             let (pose, rotation) = (&estimate.second_from_first, &turn.second_from_first);
             misfit_of_rotation((bearings.0, bearings.1), (sigmas.0, sigmas.1), &both, pose, rotation)
-                <= params.max_rotation_misfit.powi(2)
+                .is_none_or(|misfit| misfit <= params.max_rotation_misfit.powi(2))
         }
     });
     let mut second_from_first = estimate.second_from_first;

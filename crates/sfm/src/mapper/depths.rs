@@ -17,7 +17,6 @@ use setloc_features::{Match, Rays};
 
 use super::{
     continuation::{depth_sigma, known_points, of_unknown_direction, reference_of},
-    merge::median,
     model::Model,
     plane::SeenPoint,
     support::is_for,
@@ -25,6 +24,7 @@ use super::{
 };
 use crate::{
     BaselineLength, ImageId, Rigid, StepPose, direction,
+    robust::median,
     solvers::triangulation::{WorldRay, triangulate},
 };
 

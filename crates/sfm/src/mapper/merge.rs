@@ -39,7 +39,10 @@ use super::{
     structure::{complete_and_merge, connect},
     support::Support,
 };
-use crate::{ImageId, PointId, Rigid, Similarity, robust::RansacParams};
+use crate::{
+    ImageId, PointId, Rigid, Similarity,
+    robust::{RansacParams, median},
+};
 
 /// What became of two components that matches cross.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -833,13 +836,6 @@ fn may_be_unfit(num_unfit: usize, of: usize, is_beyond_doubt: bool) -> bool {
 /// Whether so many matches agree, of those expected by likeness, that what is missing is hidden.
 fn outweighs_walls(agreeing: usize, expected: f64, least: f64) -> bool {
     agreeing >= MIN_STRONG && expected >= MIN_EXPECTED_MATCHES && agreeing as f64 >= least * expected
-}
-
-/// The upper middle of the finite values.
-pub(crate) fn median(mut values: Vec<f64>) -> Option<f64> {
-    values.retain(|value| value.is_finite());
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
 }
 
 #[cfg(test)]

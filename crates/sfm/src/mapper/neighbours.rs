@@ -12,8 +12,8 @@ use std::collections::BTreeMap;
 use rayon::prelude::*;
 use setloc_features::Rays;
 
-use super::{MapperInput, merge::median, witnesses::on_circles};
-use crate::{ImageId, Rigid, direction};
+use super::{MapperInput, witnesses::on_circles};
+use crate::{ImageId, Rigid, direction, robust::median};
 
 /// Fewest pairs of about the same distance whose mean is what one of that distance ought to share.
 const MIN_PAIRS_AVERAGED: usize = 5;

@@ -405,17 +405,16 @@ fn sees_the_overlap(
     rays: &[Rays],
 ) -> bool {
     let turn = pair.two_view.second_from_first.rotation;
+    let own = |image: ImageId| input.images[image.index()].features.own_len();
     let shared = |from: ImageId, to: ImageId, turn: UnitQuaternion<f64>| {
-        let bearings = &rays[from.index()].bearings[..input.images[from.index()].features.own_len()];
-        let camera = input.camera_of(to);
-        let shared = bearings.iter().filter(|bearing| is_in_image(camera, &(turn * *bearing))).count();
-        (shared, shared as f64 <= MAX_COMMON_SHARE * bearings.len() as f64)
+        let (bearings, camera) = (&rays[from.index()].bearings[..own(from)], input.camera_of(to));
+        bearings.iter().filter(|bearing| is_in_image(camera, &(turn * *bearing))).count() as f64
     };
-    let (ahead, first_shows_more) = shared(pair.first, pair.second, turn);
-    let (_, second_shows_more) = shared(pair.second, pair.first, turn.inverse());
-    first_shows_more
-        && second_shows_more
-        && pair.two_view.inliers.len() as f64 >= params.min_turn_recall * ahead as f64
+    let of_first = shared(pair.first, pair.second, turn);
+    let of_second = shared(pair.second, pair.first, turn.inverse());
+    pair.two_view.inliers.len() as f64 >= params.min_turn_recall * of_first
+        && of_first <= MAX_COMMON_SHARE * own(pair.first) as f64
+        && of_second <= MAX_COMMON_SHARE * own(pair.second) as f64
 }
 
 /// Share of a photo's keypoints above which another of its standpoint shows all that it does.

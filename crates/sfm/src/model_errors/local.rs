@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use setloc_features::Camera;
 
 use super::shared::{Residual, residuals_of_images};
-use crate::{ImageId, Reconstruction, mapper::median};
+use crate::{ImageId, Reconstruction, robust::median};
 
 /// Directions of windows about the vertical, and their half width and height as tangents: a usual photo's.
 const WINDOWS: usize = 8;

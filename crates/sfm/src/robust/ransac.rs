@@ -68,9 +68,7 @@ impl RansacParams {
             f64::from(self.min_iterations),
         )
     }
-}
 
-impl RansacParams {
     /// The same with no more samples than find what `supporting` of so many data support; at most as many as now. `None` where
     /// there are fewer.
     ///

@@ -4,9 +4,8 @@ use rand_chacha::ChaCha8Rng;
 use super::absolute_pose::{cauchy_scale, turned};
 use super::least_squares::{LeastSquares, Normal, cauchy, minimize};
 use super::ransac::{Consensus, Consented, RansacParams, distinct, lo_ransac, lo_ransac_from, robust_cost};
-use super::residual::AngularResidual;
+use super::{median, residual::AngularResidual};
 use crate::Rigid;
-use crate::mapper::median;
 use crate::solvers::essential::{is_in_front, rotations_of_essential};
 use crate::solvers::{five_point, tangent_basis, upright_three_point};
 
@@ -141,37 +140,29 @@ pub fn estimate_rotation(
 ///
 /// A rotation has errors in two dimensions, an epipolar line in the one across it. Where there is no baseline both are the noise
 /// of the keypoints, which may be far below the stated one; where there is one, the rotation's are the parallax, too. `matches`
-/// are indices of those that both explain.
+/// are indices of those that both explain; `None` without any.
 pub(crate) fn misfit_of_rotation(
     (first, second): (&[Vector3<f64>], &[Vector3<f64>]),
     (sigmas_first, sigmas_second): (&[f64], &[f64]),
     matches: &[u32],
     second_from_first: &Rigid,
     rotation: &UnitQuaternion<f64>,
-) -> f64 {
+) -> Option<f64> {
     let params = RansacParams::default();
-    let Some(data) = RelativeMatches::new(&params, first, second, sigmas_first, sigmas_second) else {
-        return 1.0;
-    };
-    let Some(translation) = second_from_first.translation.try_normalize(0.0) else { return 1.0 };
+    let data = RotationConsensus(RelativeMatches::new(&params, first, second, sigmas_first, sigmas_second)?);
     let pose = SecondFromFirst {
         rotation: second_from_first.rotation.to_rotation_matrix().into_inner(),
-        translation,
+        translation: second_from_first.translation.try_normalize(0.0)?,
     };
     let turned = rotation.to_rotation_matrix().into_inner();
     let squared_of_pose = |&index: &u32| {
-        let term = data.sampson(&pose, index as usize);
+        let term = data.0.sampson(&pose, index as usize);
         term.error * term.error / term.variance
     };
-    let squared_of_turn = |&index: &u32| {
-        let (a, b) = data.variances[index as usize];
-        let rotated = turned * first[index as usize];
-        AngularResidual::squared(&second[index as usize], &rotated, 1.0 / (a + b))
-    };
-    let of_pose = median(matches.iter().map(squared_of_pose).collect());
-    let of_turn = median(matches.iter().map(squared_of_turn).collect());
-    let (Some(of_pose), Some(of_turn)) = (of_pose, of_turn) else { return 1.0 };
-    (of_turn / MEDIAN_OF_TWO) / (of_pose / MEDIAN_OF_ONE).max(LEAST_VARIANCE)
+    let squared_of_turn = |&index: &u32| data.squared_residual(&turned, index as usize, f64::INFINITY);
+    let of_pose = median(matches.iter().map(squared_of_pose).collect())?;
+    let of_turn = median(matches.iter().map(squared_of_turn).collect())?;
+    Some((of_turn / MEDIAN_OF_TWO) / (of_pose / MEDIAN_OF_ONE).max(LEAST_VARIANCE))
 }
 
 /// Median of the square of a standard normal variable, and of the sum of two such.
