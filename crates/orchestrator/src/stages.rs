@@ -16,7 +16,7 @@ pub const FEATURES_VERSION: u32 = FeatureParams::VERSION;
 /// Version of matching.
 pub const MATCHING_VERSION: u32 = MatchParams::VERSION;
 /// Version of the comparison of all images by their strongest keypoints.
-pub const LIKELY_VERSION: u32 = 1;
+pub const LIKELY_VERSION: u32 = 2;
 /// Version of what is said of a model's components.
 pub const LEFT_APART_VERSION: u32 = 1;
 /// Version of two-view verification.
@@ -40,8 +40,8 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// 17: what it may be off by its points' residuals, too. 18: warns of what is hardly held. 19: other signs. 20: in the hash of
 /// what localization depends on. 22: says of parts joined across walls why. 23: adjusted to measured positions, too.
 /// 24: panoramas twist directions, too. 25: each a little by its own. 26: says how their windows are stretched.
-/// 28: in doubt where images stand together and share next to nothing.
-pub const SCENE_VERSION: u32 = 28;
+/// 28: in doubt where images stand together and share next to nothing. 29: and matches contradict that.
+pub const SCENE_VERSION: u32 = 29;
 /// Version of the search for the scene points nearest to a photo's features.
 pub const NEAREST_VERSION: u32 = setloc_index::VERSION;
 /// Version of single-photo localization.

@@ -2,6 +2,7 @@
 
 mod adjust;
 mod ambiguity;
+mod bend;
 mod calibration;
 pub(crate) mod continuation;
 mod corner;
@@ -76,7 +77,7 @@ use self::{
 use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind};
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 59;
+pub const MAPPER_VERSION: u32 = 60;
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///
@@ -191,6 +192,8 @@ struct Mapper<'a> {
     baseline_tried: BTreeMap<usize, usize>,
     /// The same for planes.
     planes_tried: BTreeMap<usize, usize>,
+    /// Images about which it was tried to straighten the model.
+    straightened: Vec<bool>,
     records: Vec<RegistrationRecord>,
     images_at_last_global: usize,
     /// What judges poses in place of what is in plain view, where a floor repeats itself.
@@ -231,6 +234,7 @@ impl<'a> Mapper<'a> {
             refused_at: vec![0; input.images.len()],
             baseline_tried: BTreeMap::new(),
             planes_tried: BTreeMap::new(),
+            straightened: vec![false; input.images.len()],
             records: Vec::new(),
             witnesses: None,
             admits_latecomers: false,
@@ -528,6 +532,11 @@ impl<'a> Mapper<'a> {
         let mut expelled = 0;
         let mut waiting: Vec<ImageId> = self.model.registered().collect();
         while let Some(group) = self.most_contradicted() {
+            if let [image] = group[..]
+                && self.straighten(image)
+            {
+                continue;
+            }
             for image in group {
                 if let Some(seen) = self.seen_by(image) {
                     self.expel(image, &seen);

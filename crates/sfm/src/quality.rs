@@ -118,15 +118,16 @@ const DOUBTFUL_STEPS: usize = 2;
 /// The registered images of a component about which it may be folded; ascending.
 ///
 /// Those that no link ties to most others once the links that such pairs outweigh are cut, all where none ties more than
-/// half; those that stand together and share nothing; and those that share points with either, as what looks alike there may have
-/// misplaced these, too.
+/// half; those that stand together and share nothing, which matches contradict, too; and those that share points with either, as
+/// what looks alike there may have misplaced these, too.
 pub fn doubtful_images(
     component: &Reconstruction,
     outvoted: &[OutvotedPair],
     suspicious: &[SuspiciousNeighbours],
 ) -> Vec<ImageId> {
     let mut doubtful = beyond_outweighed_links(component, outvoted);
-    doubtful.extend(suspicious.iter().flat_map(|pair| [pair.first, pair.second]));
+    let folded = suspicious.iter().filter(|pair| pair.is_contradicted);
+    doubtful.extend(folded.flat_map(|pair| [pair.first, pair.second]));
     if doubtful.is_empty() {
         return Vec::new();
     }
@@ -174,6 +175,8 @@ pub struct SuspiciousNeighbours {
     pub expected: usize,
     /// Those that it does see.
     pub shared: usize,
+    /// Whether many matches of either, too, contradict the model: without these it may as well be trees or a wall that stand between.
+    pub is_contradicted: bool,
 }
 
 /// What disagrees, counted; [`Self::sentences`] says it in words.
@@ -309,8 +312,9 @@ pub fn assess(
     let shared_points = |a: usize, b: usize| shared[a * n + b].max(shared[b * n + a]);
     let links = strongest_links(n, shared_points);
     let spots = Groups::of_one_spot(&reconstruction.images);
-    let heavy = report.disagreements.iter().filter(|pair| pair.is_heavy());
-    report.outvoted = heavy.filter_map(|pair| outvoted(pair, &spots, &links)).collect();
+    let heavy: Vec<&PairDisagreement> = report.disagreements.iter().filter(|pair| pair.is_heavy()).collect();
+    let contradicted: BTreeSet<ImageId> = heavy.iter().flat_map(|pair| [pair.first, pair.second]).collect();
+    report.outvoted = heavy.into_iter().filter_map(|pair| outvoted(pair, &spots, &links)).collect();
     let of_images = |a: ImageId, b: ImageId| shared_points(a.index(), b.index());
     report.outvoted.extend(estranged(reconstruction, larger, pairs, of_images));
     for first in reconstruction.registered() {
@@ -326,7 +330,10 @@ pub fn assess(
                 && wanted >= params.min_expected_points
                 && (got as f64) < params.min_shared_view * wanted as f64
             {
-                report.suspicious.push(SuspiciousNeighbours { first, second, expected: wanted, shared: got });
+                let is_contradicted = contradicted.contains(&first) || contradicted.contains(&second);
+                let found =
+                    SuspiciousNeighbours { first, second, expected: wanted, shared: got, is_contradicted };
+                report.suspicious.push(found);
             }
         }
         if points_of[first.index()] < params.min_image_points {
@@ -432,11 +439,16 @@ impl QualityReport {
         together.sort_by(|a, b| share(a).total_cmp(&share(b)));
         for pair in together.iter().take(MOST_NAMED) {
             lines.push(format!(
-                "{} and {} stand together in the model but share {} of {} points that both ought to see: the scene may be folded there",
+                "{} and {} stand together in the model but share {} of {} points that both ought to see: {}",
                 name(pair.first),
                 name(pair.second),
                 pair.shared,
-                pair.expected
+                pair.expected,
+                if pair.is_contradicted {
+                    "the scene may be folded there"
+                } else {
+                    "something stands between them, or the scene is folded there"
+                }
             ));
         }
         if together.len() > MOST_NAMED {
@@ -569,6 +581,16 @@ mod tests {
         let report = assess(&QualityParams::default(), &model, &[], &[]);
         assert_eq!(report.suspicious.len(), 1, "{report:?}");
         assert!(report.sentences(&model)[0].starts_with("a and b stand together"));
+        assert!(!report.suspicious[0].is_contradicted);
+        let inliers = (0..60).map(|at| Match { first: at, second: at }).collect();
+        let two_view = TwoView {
+            kind: TwoViewKind::General,
+            second_from_first: Rigid::identity(),
+            inliers,
+            median_parallax_rad: 0.0,
+        };
+        let pair = PairGeometry { first: ImageId(0), second: ImageId(1), two_view };
+        assert!(assess(&QualityParams::default(), &model, &[], &[pair]).suspicious[0].is_contradicted);
         // What the second sees is at its feet, which the first sees from elsewhere: a wall may part them.
         let mut beside = model.clone();
         for point in beside.points.iter_mut().filter(|point| point.track[0].image == ImageId(1)) {
@@ -668,9 +690,16 @@ mod tests {
         }
         assert_eq!(doubtful_images(&model, &[pair(210, &[0])], &[]), [0, 1, 2].map(ImageId));
         // Two that stand together and share nothing are in doubt, too.
-        let together =
-            SuspiciousNeighbours { first: ImageId(0), second: ImageId(6), expected: 300, shared: 2 };
-        assert_eq!(doubtful_images(&model, &[], &[together]), [0, 1, 2, 5, 6].map(ImageId));
+        let together = |is_contradicted| SuspiciousNeighbours {
+            first: ImageId(0),
+            second: ImageId(6),
+            expected: 300,
+            shared: 2,
+            is_contradicted,
+        };
+        assert_eq!(doubtful_images(&model, &[], &[together(true)]), [0, 1, 2, 5, 6].map(ImageId));
+        // Trees may stand between two that no match speaks against.
+        assert_eq!(doubtful_images(&model, &[], &[together(false)]), []);
     }
 
     #[test]

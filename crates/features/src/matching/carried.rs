@@ -4,7 +4,11 @@
 //! heading changed between two panoramas, and a logo that covers the nadir is half of all matches of a hall with bare walls. Ground
 //! moves: 25° below the horizon it is no farther than 2.2 times the camera's height, and a step of a hundredth of
 //! that height moves it by more than [`SAME`].
+//!
+//! A logo may be drawn larger in one panorama than in another, as if seen from another height: then it is as many times as far
+//! from the nadir in all directions. Whatever the turn and the scale, one place of the ground at most agrees with both.
 
+use std::collections::BTreeMap;
 use std::f32::consts::{PI, TAU};
 
 use super::{Elevations, Match};
@@ -21,14 +25,26 @@ const FEWEST: usize = 8;
 const ONE_PLACE: f64 = 0.5;
 /// Headings that are told apart.
 const HEADINGS: usize = 720;
+/// Elevation of what is taken for the nadir.
+const AT_NADIR: f32 = -89.9 * PI / 180.0;
+/// Logarithms of scales that are told apart.
+const SCALE_STEP: f32 = 0.02;
+/// Into so many parts the full turn is cut, of which each shows a thing of another scale: what is below the camera lies on all sides.
+const SIDES: usize = 3;
+/// Fewest matches on each side.
+const FEWEST_A_SIDE: usize = 2;
 
 /// Where a match lies in two level panoramas.
 #[derive(Debug, Clone, Copy)]
 struct Place {
-    /// The higher of the two elevations.
+    /// Its elevations.
+    elevations: [f32; 2],
+    /// The higher of the two.
     highest: f32,
     /// By how much they differ.
     risen: f32,
+    /// Its azimuth in the first, from 0 to a full turn.
+    azimuth: f32,
     /// How far the second is turned from the first, from 0 to a full turn.
     turned: f32,
 }
@@ -37,13 +53,32 @@ impl Place {
     fn of([first, second]: [&Keypoint; 2], [of_first, of_second]: [Elevations; 2]) -> Self {
         let [from, to] = [of_first.at(first.y), of_second.at(second.y)];
         let azimuth = |keypoint: &Keypoint, elevations: Elevations| keypoint.x * elevations.per_row();
+        let azimuth_in_first = azimuth(first, of_first).rem_euclid(TAU);
         let turned = (azimuth(second, of_second) - azimuth(first, of_first)).rem_euclid(TAU);
-        Self { highest: from.max(to), risen: (from - to).abs(), turned }
+        let (highest, risen) = (from.max(to), (from - to).abs());
+        Self { elevations: [from, to], highest, risen, azimuth: azimuth_in_first, turned }
     }
 
     /// Whether nothing but this heading is between the two.
     fn keeps(&self, heading: f32) -> bool {
-        self.risen <= SAME && self.turned_beyond(heading).abs() * self.highest.cos() <= SAME
+        self.risen <= SAME && self.is_turned_by(heading)
+    }
+
+    fn is_turned_by(&self, heading: f32) -> bool {
+        self.turned_beyond(heading).abs() * self.highest.cos() <= SAME
+    }
+
+    /// The logarithm of how many times as far from the nadir the second shows it on the ground, which is level.
+    fn log_scale(&self) -> f32 {
+        // The nadir itself is as far from it at any scale.
+        let log_slope = |elevation: f32| (-elevation.max(AT_NADIR).tan()).ln();
+        log_slope(self.elevations[0]) - log_slope(self.elevations[1])
+    }
+
+    /// Whether nothing but this heading and this scale, given by its logarithm, is between the two.
+    fn keeps_scaled(&self, [heading, log_scale]: [f32; 2]) -> bool {
+        let scaled = (self.elevations[0].max(AT_NADIR).tan() * (-log_scale).exp()).atan();
+        (scaled - self.elevations[1]).abs() <= SAME && self.is_turned_by(heading)
     }
 
     /// How much farther the second is turned than by a heading, from minus to plus half a turn.
@@ -66,14 +101,56 @@ pub(super) fn without_carried(
     let places: Vec<Place> = matches.iter().map(place).collect();
     let is_low = |place: &Place| place.highest < BELOW;
     let (low, others): (Vec<&Place>, Vec<&Place>) = places.iter().partition(|place| is_low(place));
-    let Some(heading) = common_heading(&low) else { return matches };
-    let kept_of = |some: &[&Place]| some.iter().filter(|place| place.keeps(heading)).count();
-    let is_one_place = || !others.is_empty() && kept_of(&others) as f64 >= ONE_PLACE * others.len() as f64;
-    if kept_of(&low) < FEWEST || is_one_place() {
-        return matches;
+    let is_most = |some: usize, of: usize| of > 0 && some as f64 >= ONE_PLACE * of as f64;
+    let without = |is_carried: &dyn Fn(&Place) -> bool| {
+        let stays = |place: &Place| !(is_low(place) && is_carried(place));
+        matches.iter().zip(&places).filter(|(_, place)| stays(place)).map(|(m, _)| *m).collect()
+    };
+    if let Some(heading) = common_heading(&low) {
+        let kept_of = |some: &[&Place]| some.iter().filter(|place| place.keeps(heading)).count();
+        if kept_of(&low) >= FEWEST {
+            let is_one_place = is_most(kept_of(&others), others.len());
+            return if is_one_place { matches } else { without(&|place| place.keeps(heading)) };
+        }
     }
-    let is_carried = |place: &Place| is_low(place) && place.keeps(heading);
-    matches.into_iter().zip(&places).filter(|(_, place)| !is_carried(place)).map(|(m, _)| m).collect()
+    if let Some(scaled) = common_scale(&low) {
+        // From two heights over one place all that is near rises or sinks.
+        let kept = others.iter().filter(|place| place.is_turned_by(scaled[0])).count();
+        if !is_most(kept, others.len()) {
+            return without(&|place| place.keeps_scaled(scaled));
+        }
+    }
+    matches
+}
+
+/// The heading, and the logarithm of the scale, that matches on all sides of the nadir have in common.
+fn common_scale(places: &[&Place]) -> Option<[f32; 2]> {
+    let bin = |place: &Place| {
+        let heading = (place.turned / TAU * HEADINGS as f32) as i32 % HEADINGS as i32;
+        (heading, (place.log_scale() / SCALE_STEP).floor() as i32)
+    };
+    let mut counts = BTreeMap::<(i32, i32), usize>::new();
+    for place in places {
+        *counts.entry(bin(place)).or_default() += 1;
+    }
+    let around = |(heading, scale): (i32, i32)| {
+        let headings = [-1, 0, 1].map(|off| (heading + off).rem_euclid(HEADINGS as i32));
+        headings.into_iter().flat_map(move |heading| [-1, 0, 1].map(|off| (heading, scale + off)))
+    };
+    let count = |at| around(at).filter_map(|at| counts.get(&at)).sum::<usize>();
+    let best = counts.keys().copied().max_by_key(|&at| (count(at), std::cmp::Reverse(at)))?;
+    let near: Vec<&&Place> = places.iter().filter(|place| around(best).any(|at| at == bin(place))).collect();
+    let middle = (best.0 as f32 + 0.5) / HEADINGS as f32 * TAU;
+    let off: f32 = near.iter().map(|place| place.turned_beyond(middle)).sum();
+    let heading = (middle + off / near.len() as f32).rem_euclid(TAU);
+    let log_scale = near.iter().map(|place| place.log_scale()).sum::<f32>() / near.len() as f32;
+    let found = [heading, log_scale];
+    let mut sides = [0; SIDES];
+    for place in places.iter().filter(|place| place.keeps_scaled(found)) {
+        sides[(place.azimuth / TAU * SIDES as f32) as usize % SIDES] += 1;
+    }
+    let is_thing = sides.iter().sum::<usize>() >= FEWEST && sides.iter().all(|&count| count >= FEWEST_A_SIDE);
+    is_thing.then_some(found)
 }
 
 /// The heading between two panoramas that most of these matches have in common.
@@ -165,6 +242,34 @@ mod tests {
             assert_eq!(carried, 0);
         }
         assert_eq!(stay(2.0, 1.0, [0, 0, 40]), [0, 0, 0]);
+    }
+
+    #[test]
+    fn a_logo_that_is_drawn_larger_in_one_panorama_is_left_out() {
+        let [ground, walls] = [things(100, [4.0, -1.6]), things(60, [9.0, 1.0])];
+        let logo = |scale: f32| things(40, [0.6 * scale, -1.0]).into_iter().map(|thing| shown(0.3, thing));
+        let rest = |step: f32| {
+            let all = ground.iter().chain(&walls);
+            all.map(move |&[east, north, up]| shown(0.2 * step, [east, north - step, up]))
+        };
+        for scale in [0.6, 0.865, 1.3] {
+            let (first, second): (Vec<_>, Vec<_>) =
+                (rest(0.0).chain(logo(1.0)).collect(), rest(2.0).chain(logo(scale)).collect());
+            let all = (0..first.len() as u32).map(|at| Match { first: at, second: at }).collect();
+            let kept = without_carried(all, elevations(), &features(first), &features(second));
+            let of_logo = kept.iter().filter(|m| m.first >= 160).count();
+            assert!(of_logo == 0 && kept.len() >= 157, "{of_logo} of the logo in {} at {scale}", kept.len());
+        }
+    }
+
+    #[test]
+    fn panoramas_at_two_heights_over_one_place_keep_all() {
+        let all: Vec<[f32; 3]> = things(100, [4.0, -1.6]).into_iter().chain(things(60, [9.0, 1.0])).collect();
+        let seen =
+            |lift: f32| all.iter().map(move |&[east, north, up]| shown(lift, [east, north, up - lift]));
+        let matches: Vec<Match> = (0..160).map(|at| Match { first: at, second: at }).collect();
+        let [first, second] = [0.0, 0.5].map(|lift| features(seen(lift).collect()));
+        assert_eq!(without_carried(matches, elevations(), &first, &second).len(), 160);
     }
 
     #[test]

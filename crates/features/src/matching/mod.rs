@@ -77,8 +77,8 @@ impl MatchParams {
     /// 2: bright and dark spots apart, screened by the strongest. 3: simulated views. 4: which do not count among those
     /// that are worth screening. 5: without the last bit of descriptors; keypoints of level images that are turned alike.
     /// 6: small images are taken for level by their strongest keypoints, too. 7: keypoints of level images that can show the
-    /// same by height and size, too. 9: these in simulated views as well.
-    pub const VERSION: u32 = 9;
+    /// same by height and size, too. 9: these in simulated views as well. 10: without logos below of another scale.
+    pub const VERSION: u32 = 10;
 
     /// Checks the ranges.
     ///

@@ -111,7 +111,7 @@ impl Mapper<'_> {
     }
 
     /// What the verified pairs of an image say of a pose.
-    fn support(&self, image: ImageId, world_from_camera: &Rigid) -> Support {
+    pub(super) fn support(&self, image: ImageId, world_from_camera: &Rigid) -> Support {
         Support::of(&self.model, &self.taken, image, world_from_camera, self.params.max_error_sigma)
     }
 
