@@ -18,19 +18,22 @@ use setloc_orchestrator::session::{Limits, Session};
 use setloc_orchestrator::stages;
 use setloc_orchestrator::turning::guess_by_turns;
 use setloc_town::{TownParams, write_dataset};
+use tempfile::TempDir;
 
 fn bench(dataset: &Path) -> DatasetFigures {
     bench_with(dataset, Config::default())
 }
 
 fn bench_with(dataset: &Path, config: Config) -> DatasetFigures {
-    bench_as(dataset, &BenchOptions { config, seed: 0, gps: BenchGps::None, joint_reference: false })
+    bench_in(tempfile::tempdir().unwrap().path(), dataset, &BenchOptions { config, ..bench_options() })
 }
 
-fn bench_as(dataset: &Path, options: &BenchOptions) -> DatasetFigures {
-    let store = tempfile::tempdir().unwrap();
-    let session = session(store.path());
-    bench_dataset(&session, dataset, options).unwrap()
+fn bench_in(store: &Path, dataset: &Path, options: &BenchOptions) -> DatasetFigures {
+    bench_dataset(&session(store), dataset, options).unwrap()
+}
+
+fn bench_options() -> BenchOptions {
+    BenchOptions { config: Config::default(), seed: 0, gps: BenchGps::None, joint_reference: false }
 }
 
 fn session(store: &Path) -> Session {
@@ -83,9 +86,33 @@ fn sample() -> &'static Path {
     })
 }
 
+/// A store of one's own that holds the sample's scene and where its sets are, which are made once for all tests.
+fn store_of_sample() -> TempDir {
+    static STORE: OnceLock<PathBuf> = OnceLock::new();
+    let built = STORE.get_or_init(|| {
+        let store = Path::new(env!("CARGO_TARGET_TMPDIR")).join("store");
+        if store.exists() {
+            std::fs::remove_dir_all(&store).unwrap();
+        }
+        bench_in(&store, sample(), &bench_options());
+        store
+    });
+    let store = tempfile::tempdir().unwrap();
+    copy_files(built, store.path());
+    store
+}
+
+/// Images of the sample, whose cameras are told or not.
+fn sample_images(part: &str, told: bool) -> ImageFolder {
+    let cameras =
+        if told { CameraBook::read(&sample().join("cameras.json")).unwrap() } else { CameraBook::default() };
+    let files = list_images(&[sample().join(part)]).unwrap();
+    ImageFolder::read(&files, &cameras, &GeoSource::None, None).unwrap()
+}
+
 #[test]
 fn the_town_is_mapped_and_its_set_located() {
-    let figures = bench(sample());
+    let figures = bench_in(store_of_sample().path(), sample(), &bench_options());
     assert!(!figures.sets.is_empty());
     assert_main_job(&figures);
 }
@@ -95,9 +122,8 @@ fn a_set_without_truth_is_compared_with_a_reconstruction_of_scene_and_photos_tog
     let folder = tempfile::tempdir().unwrap();
     copy_files(sample(), folder.path());
     std::fs::remove_file(folder.path().join("truth.json")).unwrap();
-    let config = Config::default();
-    let options = BenchOptions { config, seed: 0, gps: BenchGps::None, joint_reference: true };
-    let figures = bench_as(folder.path(), &options);
+    let options = BenchOptions { joint_reference: true, ..bench_options() };
+    let figures = bench_in(store_of_sample().path(), folder.path(), &options);
     let joint = figures.joint_reference.as_ref().unwrap();
     let photos: usize = figures.sets.iter().map(|set| set.images).sum();
     assert_eq!((joint.scene_images, joint.photos), (figures.scene.images, photos));
@@ -111,18 +137,12 @@ fn a_set_without_truth_is_compared_with_a_reconstruction_of_scene_and_photos_tog
 
 #[test]
 fn a_set_of_unknown_intrinsics_is_located_and_tells_them() {
-    let (folder, store) = (sample(), tempfile::tempdir().unwrap());
+    let store = store_of_sample();
     let session = session(store.path());
-    let read = |part: &str, cameras: &CameraBook| {
-        let files = list_images(&[folder.join(part)]).unwrap();
-        ImageFolder::read(&files, cameras, &GeoSource::None, None).unwrap()
-    };
     let config = Config::default();
-    let panoramas = read("panoramas", &CameraBook::default());
-    let built = built(&session, &panoramas, &config);
+    let built = built(&session, &sample_images("panoramas", true), &config);
     let what = LocateJobs { scene: Arc::clone(&built.scene), pictures: Arc::default(), config, seed: 0 };
-    let known = CameraBook::read(&folder.join("cameras.json")).unwrap();
-    let mut by_cameras = [read("queries/lane", &known), read("queries/lane", &CameraBook::default())];
+    let mut by_cameras = [true, false].map(|told| sample_images("queries/lane", told));
     let truth = by_cameras[0].images[0].camera.clone();
     let guess = by_cameras[1].images[0].camera.clone();
     assert!((guess.focal_length() / truth.focal_length() - 1.0).abs() > 0.2, "{guess:?} {truth:?}");
@@ -147,17 +167,11 @@ fn a_set_of_unknown_intrinsics_is_located_and_tells_them() {
 
 #[test]
 fn photos_localized_earlier_localize_one_that_the_panoramas_do_not() {
-    let (folder, store) = (sample(), tempfile::tempdir().unwrap());
+    let store = store_of_sample();
     let session = session(store.path());
-    let cameras = CameraBook::read(&folder.join("cameras.json")).unwrap();
-    let read = |part: &str| {
-        let files = list_images(&[folder.join(part)]).unwrap();
-        ImageFolder::read(&files, &cameras, &GeoSource::None, None).unwrap()
-    };
     let config = Config::default();
-    let panoramas = read("panoramas");
-    let built = built(&session, &panoramas, &config);
-    let mut bridging = read("queries/lane");
+    let built = built(&session, &sample_images("panoramas", true), &config);
+    let mut bridging = sample_images("queries/lane", true);
     // The last one stands too far on for those before it, too.
     bridging.images.pop();
     let mut target =
@@ -233,7 +247,7 @@ fn a_real_set_of_which_one_standpoint_sees_the_scene_gets_its_scale_from_a_facad
     let deviations = |scale_by_walls: bool| -> Vec<f64> {
         let mut config = Config::default();
         config.camset.scale_by_walls = scale_by_walls;
-        let options = BenchOptions { config, seed: 0, gps: BenchGps::None, joint_reference: false };
+        let options = BenchOptions { config, ..bench_options() };
         let figures = bench_dataset(&session, folder.path(), &options).unwrap();
         let deviation = |photo: &PhotoLocalization| {
             let variance = photo.covariance.map(|covariance| covariance.fixed_view::<3, 3>(3, 3).trace());

@@ -1,12 +1,8 @@
 //! Photos in a scene of several components: two towns that share nothing.
 
-#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
-
-mod common;
-
 use std::path::Path;
 
-use common::{gave, said, setloc, small_town};
+use crate::common::{gave, said, setloc, small_town};
 use serde_json::{Value, json};
 use setloc_town::TownParams;
 

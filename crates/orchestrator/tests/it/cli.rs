@@ -1,10 +1,6 @@
 //! What the program says: help, errors with their hints, reports. `INSTA_UPDATE=always` accepts new texts.
 
-#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
-
-mod common;
-
-use common::{gave, panoramas, said, setloc, town};
+use crate::common::{gave, panoramas, said, setloc, town};
 
 #[test]
 fn help_says_what_there_is() {

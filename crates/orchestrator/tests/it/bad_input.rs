@@ -1,12 +1,8 @@
 //! The program on bad input: exit codes and what it says.
 
-#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
-
-mod common;
-
 use std::fs::OpenOptions;
 
-use common::{gave, panoramas, program, said, setloc, town};
+use crate::common::{gave, panoramas, program, said, setloc, town};
 
 fn picture(shade: u8) -> image::RgbImage {
     image::RgbImage::from_fn(256, 128, |x, y| image::Rgb([(x as u8) ^ (y as u8).wrapping_mul(shade); 3]))

@@ -3,14 +3,10 @@
 //! Each test mounts a file system of its own in a namespace of its own, as any user may on most Linux systems; where
 //! that is not allowed it says so and passes.
 
-#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
-
-mod common;
-
 use std::path::Path;
 use std::process::{Command, Output};
 
-use common::{said, town};
+use crate::common::{said, town};
 
 /// Runs a shell script in which `setloc` is the program and `store/` a file system of its own.
 fn with_small_disk(folder: &Path, size: &str, script: &str) -> Option<Output> {

@@ -1,10 +1,6 @@
 //! Scenes of photos whose intrinsics nobody knows.
 
-#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
-
-mod common;
-
-use common::{said, setloc};
+use crate::common::{said, setloc};
 use serde_json::Value;
 use setloc_town::TownParams;
 

@@ -1,12 +1,8 @@
 //! The benchmark harness: registry, repeats, baseline, page.
 
-#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
-
-mod common;
-
 use std::path::Path;
 
-use common::{gave, said, setloc, town};
+use crate::common::{gave, said, setloc, town};
 use serde_json::{Value, json};
 
 const REGISTRY: &str = r#"

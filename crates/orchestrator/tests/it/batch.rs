@@ -1,12 +1,8 @@
 //! Many scenes and sets from one manifest.
 
-#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
-
-mod common;
-
 use std::path::Path;
 
-use common::{gave, logged, panoramas, said, setloc, town};
+use crate::common::{gave, logged, panoramas, said, setloc, town};
 
 /// Lines of the summary: name and outcome.
 fn summary(text: &str) -> Vec<(String, String)> {

@@ -1,9 +1,5 @@
 //! What runs again after which change, asserted by job lists.
 
-#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
-
-mod common;
-
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
@@ -18,7 +14,7 @@ use setloc_orchestrator::locating::{Mode, locate};
 use setloc_orchestrator::session::{Limits, Session};
 use setloc_town::TownParams;
 
-use common::{files_below, logged, panoramas, program, said, setloc, small_town, town, write_picture};
+use crate::common::{files_below, logged, panoramas, program, said, setloc, small_town, town, write_picture};
 
 fn build(store: &Path, panoramas: &Path, config: &Config) -> Box<Built> {
     let limits = Limits { threads: 2, memory: 1 << 30 };

@@ -1,15 +1,11 @@
 //! Stopped by Ctrl-C, killed at any moment: nothing finished is lost, and the end is that of an undisturbed run.
 
-#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
-
-mod common;
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use common::{files_below, logged, program, said, setloc, town};
+use crate::common::{files_below, logged, program, said, setloc, town};
 
 /// Starts a build in `folder`, ends it by `signal` after `delay`; whether it was still running then.
 fn build_and_signal(folder: &Path, panoramas: &str, signal: &str, delay: Duration) -> Option<i32> {

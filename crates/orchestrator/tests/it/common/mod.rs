@@ -1,8 +1,5 @@
 //! What the tests of the program share: pictures to work on, and ways to run it.
 
-#![allow(dead_code, reason = "each test file uses a part")]
-#![allow(clippy::unwrap_used, reason = "the helpers of tests, too, may fail by panicking")]
-
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
