@@ -29,7 +29,7 @@ const HEADINGS: usize = 720;
 const AT_NADIR: f32 = -89.9 * PI / 180.0;
 /// Logarithms of scales that are told apart.
 const SCALE_STEP: f32 = 0.02;
-/// Into so many parts the full turn is cut, of which each shows a thing of another scale: what is below the camera lies on all sides.
+/// Parts of the full turn, each of which has to show a thing of another scale: what is below the camera lies on all sides.
 const SIDES: usize = 3;
 /// Fewest matches on each side.
 const FEWEST_A_SIDE: usize = 2;

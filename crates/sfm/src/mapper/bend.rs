@@ -5,6 +5,8 @@
 //! Taken out, it would leave the model bent. So the model is opened to what these pairs matched, under a loss as wide, and kept if
 //! the image's pairs agree afterwards.
 
+use std::collections::BTreeMap;
+
 use super::{
     Mapper,
     adjust::{Scope, adjust},
@@ -60,20 +62,22 @@ impl Mapper<'_> {
         if self.support(image, &world_from_image).matches < self.params.min_initial_points {
             return false;
         }
-        let (mut near, mut all) = (0, 0);
+        // Of the geometries of one pair one can be right: by partner, the matches of the strongest that is near, and of any.
+        let mut of_partners = BTreeMap::<ImageId, [usize; 2]>::new();
         for pair in self.model.input.pairs {
-            let Some((other, image_from_other)) = pair.seen_from(image) else { continue };
-            let Some(other) = &self.model.poses[other.index()] else { continue };
-            let modelled = world_from_image.inverse() * other.world_from_camera;
-            let turned = modelled.rotation.angle_to(&image_from_other.rotation);
-            let aside = modelled.translation.angle(&image_from_other.translation);
+            let Some((partner, image_from_partner)) = pair.seen_from(image) else { continue };
+            let Some(pose) = &self.model.poses[partner.index()] else { continue };
+            let modelled = world_from_image.inverse() * pose.world_from_camera;
+            let turned = modelled.rotation.angle_to(&image_from_partner.rotation);
+            let aside = modelled.translation.angle(&image_from_partner.translation);
+            let is_near = turned <= MAX_BEND_RAD && aside <= MAX_TURNED_DIRECTION_RAD;
             let matches = pair.two_view.inliers.len();
-            all += matches;
-            if turned <= MAX_BEND_RAD && aside <= MAX_TURNED_DIRECTION_RAD {
-                near += matches;
-            }
+            let [near, any] = of_partners.entry(partner).or_default();
+            *near = (*near).max(if is_near { matches } else { 0 });
+            *any = (*any).max(matches);
         }
-        near as f64 >= MIN_NEAR * all as f64
+        let sum = |at: usize| of_partners.values().map(|matches| matches[at]).sum::<usize>() as f64;
+        sum(0) >= MIN_NEAR * sum(1)
     }
 }
 
