@@ -74,7 +74,7 @@ use self::{
     told::correct_told,
     witnesses::Witnesses,
 };
-use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind};
+use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind, bundle::BundleParams};
 
 /// Bumped when equal inputs and parameters give another model.
 pub const MAPPER_VERSION: u32 = 60;
@@ -621,8 +621,12 @@ impl<'a> Mapper<'a> {
     }
 
     fn adjust_all(&mut self, max_iterations: u32) {
+        self.adjust_all_by(&self.params.bundle(max_iterations));
+    }
+
+    fn adjust_all_by(&mut self, params: &BundleParams) {
         let scope = Scope::global(&self.model);
-        adjust(&mut self.model, &self.params.bundle(max_iterations), &scope);
+        adjust(&mut self.model, params, &scope);
         self.follow_anchors();
     }
 
@@ -633,7 +637,7 @@ impl<'a> Mapper<'a> {
 
     fn refine_within(&mut self, limits: PointLimits, rounds: usize, max_iterations: u32) {
         for _ in 0..rounds {
-            let observations: usize = self.model.live_points().map(|(_, point)| point.track.len()).sum();
+            let observations = self.model.observation_count();
             self.adjust_all(max_iterations);
             let mut changes = self.filter_all(limits);
             let before: usize = self.model.live_points().count();

@@ -140,9 +140,7 @@ fn common_scale(places: &[&Place]) -> Option<[f32; 2]> {
     let count = |at| around(at).filter_map(|at| counts.get(&at)).sum::<usize>();
     let best = counts.keys().copied().max_by_key(|&at| (count(at), std::cmp::Reverse(at)))?;
     let near: Vec<&&Place> = places.iter().filter(|place| around(best).any(|at| at == bin(place))).collect();
-    let middle = (best.0 as f32 + 0.5) / HEADINGS as f32 * TAU;
-    let off: f32 = near.iter().map(|place| place.turned_beyond(middle)).sum();
-    let heading = (middle + off / near.len() as f32).rem_euclid(TAU);
+    let heading = mean_heading(best.0 as usize, near.iter().map(|place| **place), near.len());
     let log_scale = near.iter().map(|place| place.log_scale()).sum::<f32>() / near.len() as f32;
     let found = [heading, log_scale];
     let mut sides = [0; SIDES];
@@ -168,10 +166,15 @@ fn common_heading(places: &[&Place]) -> Option<f32> {
     if count == 0 {
         return None;
     }
-    let middle = (best as f32 + 0.5) / HEADINGS as f32 * TAU;
     let near = level().filter(|place| around(best).contains(&bin(place)));
+    Some(mean_heading(best, near.copied(), count as usize))
+}
+
+/// The heading of places about one of the headings that are told apart.
+fn mean_heading<'p>(bin: usize, near: impl Iterator<Item = &'p Place>, count: usize) -> f32 {
+    let middle = (bin as f32 + 0.5) / HEADINGS as f32 * TAU;
     let off: f32 = near.map(|place| place.turned_beyond(middle)).sum();
-    Some((middle + off / count as f32).rem_euclid(TAU))
+    (middle + off / count as f32).rem_euclid(TAU)
 }
 
 #[cfg(test)]

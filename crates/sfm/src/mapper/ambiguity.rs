@@ -133,11 +133,11 @@ fn cost(model: &Model<'_>, params: &MapperParams, image: ImageId, features: &BTr
 mod tests {
     use nalgebra::{Matrix6, UnitQuaternion, Vector3};
     use rand::Rng;
-    use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
+    use setloc_features::{Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
 
     use super::*;
     use crate::{
-        BaselineLength, CameraId, InputImage, MapperInput, PairGeometry, TwoView, TwoViewParams,
+        BaselineLength, MapperInput, PairGeometry, TwoView,
         synthetic::{normal, rotation_angle, seeded},
     };
 
@@ -217,15 +217,7 @@ mod tests {
         for number in 0..100 {
             let photos = photos(&camera, &format!("s{number}"));
             let (pairs, image) = (pairs(), ImageId(3));
-            let images = photos.iter().map(|features| InputImage::new("photo", CameraId(0), features));
-            let input = MapperInput {
-                cameras: vec![camera.clone()],
-                calibrations: vec![Calibration::Known],
-                images: images.collect(),
-                pairs: &pairs,
-                putative: &[],
-                two_view: TwoViewParams::default(),
-            };
+            let input = MapperInput::of_one_camera(&camera, &photos, &pairs);
             let graph = CorrespondenceGraph::build(&[80; 4], &pairs, &[true; 6]);
             let mut model = Model::new(&input);
             for (index, pose) in truth.iter().enumerate().take(3) {

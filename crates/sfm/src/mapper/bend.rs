@@ -9,7 +9,6 @@ use std::collections::BTreeMap;
 
 use super::{
     Mapper,
-    adjust::{Scope, adjust},
     structure::{complete_and_merge, triangulate_image},
 };
 use crate::{
@@ -31,28 +30,23 @@ impl Mapper<'_> {
         if std::mem::replace(&mut self.straightened[image.index()], true) || !self.is_at_a_bend(image) {
             return false;
         }
-        let observations =
-            |mapper: &Self| -> usize { mapper.model.live_points().map(|(_, point)| point.track.len()).sum() };
-        let (bent, before) = (self.model.clone(), observations(self));
+        let bent = self.model.clone();
         for factor in OPENED {
             let limits = self.params.limits().widened(factor);
             triangulate_image(&mut self.model, &self.graph, limits, image);
             complete_and_merge(&mut self.model, &self.graph, limits);
             let loss = RobustLoss::Cauchy(factor * self.params.loss_sigma);
-            let params = BundleParams { loss, ..self.params.bundle(20) };
-            let scope = Scope::global(&self.model);
-            adjust(&mut self.model, &params, &scope);
-            self.follow_anchors();
+            self.adjust_all_by(&BundleParams { loss, ..self.params.bundle(20) });
             self.filter_all(limits);
         }
         self.refine(2, 20);
         let pose = self.model.poses[image.index()].as_ref();
         let is_straight = pose.is_some_and(|pose| self.support(image, &pose.world_from_camera).is_clear());
-        if !is_straight || observations(self) < before {
+        let is_kept = is_straight && self.model.observation_count() >= bent.observation_count();
+        if !is_kept {
             self.model = bent;
-            return false;
         }
-        true
+        is_kept
     }
 
     /// Whether most that speaks against an image's place speaks for one that is hardly another, and something speaks for it.
@@ -87,12 +81,12 @@ mod tests {
 
     use nalgebra::{UnitQuaternion, Vector3};
     use rand::Rng;
-    use setloc_features::{Calibration, Camera, ImageFeatures, Keypoint};
+    use setloc_features::{Camera, ImageFeatures, Keypoint};
 
-    use super::super::{InputImage, MapperInput, MapperParams, model::Model};
+    use super::super::{MapperInput, MapperParams, model::Model};
     use super::*;
     use crate::{
-        CameraId, PairGeometry, Rigid, TwoView, TwoViewParams,
+        PairGeometry, Rigid, TwoView,
         synthetic::{normal, seeded},
     };
 
@@ -159,14 +153,7 @@ mod tests {
                 ),
             })
             .collect();
-        let input = MapperInput {
-            cameras: vec![camera],
-            calibrations: vec![Calibration::Known],
-            images: features.iter().map(|features| InputImage::new("", CameraId(0), features)).collect(),
-            pairs: &pairs,
-            putative: &[],
-            two_view: TwoViewParams::default(),
-        };
+        let input = MapperInput::of_one_camera(&camera, &features, &pairs);
         let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), degrees.to_radians());
         let turned = Rigid::new(turn, Vector3::zeros());
         let mut model = Model::new(&input);

@@ -45,6 +45,26 @@ pub struct MapperInput<'a> {
     pub two_view: TwoViewParams,
 }
 
+#[cfg(test)]
+impl<'a> MapperInput<'a> {
+    /// Plain images of one known camera.
+    pub(crate) fn of_one_camera(
+        camera: &Camera,
+        features: impl IntoIterator<Item = &'a ImageFeatures>,
+        pairs: &'a [PairGeometry],
+    ) -> Self {
+        let image = |features| InputImage::new("image", CameraId(0), features);
+        Self {
+            cameras: vec![camera.clone()],
+            calibrations: vec![Calibration::Known],
+            images: features.into_iter().map(image).collect(),
+            pairs,
+            putative: &[],
+            two_view: TwoViewParams::default(),
+        }
+    }
+}
+
 impl MapperInput<'_> {
     /// Whether the intrinsics of a camera stay as they are.
     pub(crate) fn is_fixed(&self, camera: usize) -> bool {

@@ -214,11 +214,11 @@ impl Mapper<'_> {
 mod tests {
     use nalgebra::{UnitQuaternion, Vector3};
     use rand::Rng;
-    use setloc_features::{Calibration, Camera, ImageFeatures, Keypoint};
+    use setloc_features::{Camera, ImageFeatures, Keypoint};
 
     use super::*;
-    use crate::mapper::{InputImage, MapperInput, MapperParams, Model, wall};
-    use crate::{CameraId, PairGeometry, TwoView, TwoViewParams, synthetic::seeded};
+    use crate::mapper::{MapperInput, MapperParams, Model, wall};
+    use crate::{PairGeometry, TwoView, synthetic::seeded};
 
     /// Points of one wall fit two rotations, and verification may have taken the other one.
     #[test]
@@ -254,14 +254,7 @@ mod tests {
         let other = both.iter().find(|pose| off_by(pose) > 10.0).expect("the wall leaves another pose");
         let two_view = TwoView::of_equal_features(*other, 0..120);
         let pairs = [PairGeometry { first: ImageId(0), second: ImageId(1), two_view }];
-        let input = MapperInput {
-            cameras: vec![camera.clone()],
-            calibrations: vec![Calibration::Known],
-            images: features.iter().map(|features| InputImage::new("photo", CameraId(0), features)).collect(),
-            pairs: &pairs,
-            putative: &[],
-            two_view: TwoViewParams::default(),
-        };
+        let input = MapperInput::of_one_camera(&camera, &features, &pairs);
         let mut model = Model::new(&input);
         model.set_pose(ImageId(0), Some(poses[0]));
         let params = MapperParams::default();

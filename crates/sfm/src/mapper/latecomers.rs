@@ -186,10 +186,10 @@ fn crossing(first: &Edge, second: &Edge) -> Option<Rigid> {
 #[cfg(test)]
 mod tests {
     use nalgebra::UnitQuaternion;
-    use setloc_features::{Calibration, Camera, ImageFeatures};
+    use setloc_features::{Camera, ImageFeatures};
 
     use super::*;
-    use crate::{CameraId, InputImage, Reconstruction, ReconstructionImage, TwoView, TwoViewParams};
+    use crate::{CameraId, Reconstruction, ReconstructionImage, TwoView};
 
     fn edge(other: u32, from: [f64; 3], truth: &Rigid, askew_rad: f64) -> Edge {
         let from = Vector3::from(from);
@@ -235,14 +235,7 @@ mod tests {
         };
         let pairs: Vec<PairGeometry> = pairs.iter().map(pair).collect();
         let camera = Camera::equirectangular(2048, 1024);
-        let input = MapperInput {
-            cameras: vec![camera.clone()],
-            calibrations: vec![Calibration::Known],
-            images: (0..6).map(|_| InputImage::new("panorama", CameraId(0), &features)).collect(),
-            pairs: &pairs,
-            putative: &[],
-            two_view: TwoViewParams::default(),
-        };
+        let input = MapperInput::of_one_camera(&camera, [&features; 6], &pairs);
         let image = |at: u32| ReconstructionImage {
             name: at.to_string(),
             camera: CameraId(0),

@@ -195,6 +195,11 @@ impl<'a> Model<'a> {
             .filter_map(|(index, point)| Some((PointId(index as u32), point.as_ref()?)))
     }
 
+    /// Observations of all points.
+    pub fn observation_count(&self) -> usize {
+        self.live_points().map(|(_, point)| point.track.len()).sum()
+    }
+
     pub fn live_ids(&self) -> Vec<PointId> {
         self.live_points().map(|(id, _)| id).collect()
     }

@@ -2,12 +2,12 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::Rng;
-use setloc_features::{Calibration, Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
+use setloc_features::{Camera, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
 
 use super::structure::triangulate_image;
-use super::{InputImage, MapperInput, MapperParams, correspondence::CorrespondenceGraph, model::Model};
+use super::{MapperInput, MapperParams, correspondence::CorrespondenceGraph, model::Model};
 use crate::{
-    CameraId, ImageId, PairGeometry, Rigid, TwoView, TwoViewParams,
+    ImageId, PairGeometry, Rigid, TwoView,
     synthetic::{normal, seeded},
 };
 
@@ -63,15 +63,7 @@ impl Street {
     }
 
     pub fn input(&self) -> MapperInput<'_> {
-        let images = self.features.iter().map(|features| InputImage::new("panorama", CameraId(0), features));
-        MapperInput {
-            cameras: vec![self.camera.clone()],
-            calibrations: vec![Calibration::Known],
-            images: images.collect(),
-            pairs: &self.pairs,
-            putative: &[],
-            two_view: TwoViewParams::default(),
-        }
+        MapperInput::of_one_camera(&self.camera, &self.features, &self.pairs)
     }
 
     /// Adds a panorama a step from one of the three, with which it shares all points, and with no other any.

@@ -123,10 +123,10 @@ impl Views {
 mod tests {
     use nalgebra::Vector3;
     use rand::Rng;
-    use setloc_features::{Calibration, Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
+    use setloc_features::{Camera, CameraModel, DESCRIPTOR_LEN, ImageFeatures, Keypoint};
 
     use super::*;
-    use crate::{CameraId, InputImage, PutativePair, Rigid, TwoViewParams, synthetic::seeded};
+    use crate::{PutativePair, Rigid, synthetic::seeded};
 
     /// Pairs of four images by matches and degrees about the vertical, and which of them stay.
     fn kept(model: CameraModel, pairs: &[(u32, u32, u32, f64)]) -> Vec<(u32, u32)> {
@@ -139,14 +139,7 @@ mod tests {
             PairGeometry { first: ImageId(first), second: ImageId(second), two_view }
         };
         let (features, pairs) = (ImageFeatures::default(), pairs.iter().map(geometry).collect::<Vec<_>>());
-        let input = MapperInput {
-            cameras: vec![camera],
-            calibrations: vec![Calibration::Known],
-            images: vec![InputImage::new("image", CameraId(0), &features); 4],
-            pairs: &pairs,
-            putative: &[],
-            two_view: TwoViewParams::default(),
-        };
+        let input = MapperInput::of_one_camera(&camera, [&features; 4], &pairs);
         consistent(&input, 0).iter().map(|pair| (pair.first.0, pair.second.0)).collect()
     }
 
@@ -229,14 +222,7 @@ mod tests {
             [PutativePair { first: ImageId(0), second: ImageId(2), matches }]
         };
         let found = |putative: &[PutativePair]| {
-            let input = MapperInput {
-                cameras: vec![camera.clone()],
-                calibrations: vec![Calibration::Known],
-                images: features.iter().map(|image| InputImage::new("image", CameraId(0), image)).collect(),
-                pairs: &pairs,
-                putative,
-                two_view: TwoViewParams::default(),
-            };
+            let input = MapperInput { putative, ..MapperInput::of_one_camera(&camera, &features, &pairs) };
             consistent(&input, 1)
         };
         let anew = found(&putative(30));

@@ -149,11 +149,11 @@ impl Witnesses {
 #[cfg(test)]
 mod tests {
     use nalgebra::UnitQuaternion;
-    use setloc_features::{Calibration, Camera, ImageFeatures, Keypoint};
+    use setloc_features::{Camera, ImageFeatures, Keypoint};
 
     use super::*;
     use crate::{
-        CameraId, InputImage, MapperInput, TwoView, TwoViewParams,
+        MapperInput, TwoView,
         synthetic::{random_unit, seeded},
     };
 
@@ -183,14 +183,7 @@ mod tests {
                 two_view: TwoView::of_equal_features(pose(other).inverse() * pose(0), 0..POINTS as u32),
             })
             .collect();
-        let input = MapperInput {
-            cameras: vec![camera],
-            calibrations: vec![Calibration::Known],
-            images: features.iter().map(|features| InputImage::new("", CameraId(0), features)).collect(),
-            pairs: &pairs,
-            putative: &[],
-            two_view: TwoViewParams::default(),
-        };
+        let input = MapperInput::of_one_camera(&camera, &features, &pairs);
         let mut model = Model::new(&input);
         for other in 1..centers.len() {
             model.set_pose(ImageId(other as u32), Some(pose(other)));
