@@ -40,8 +40,9 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// 17: what it may be off by its points' residuals, too. 18: warns of what is hardly held. 19: other signs. 20: in the hash of
 /// what localization depends on. 22: says of parts joined across walls why. 23: adjusted to measured positions, too.
 /// 24: panoramas twist directions, too. 25: each a little by its own. 26: says how their windows are stretched.
-/// 28: in doubt where images stand together and share next to nothing. 29: and matches contradict that.
-pub const SCENE_VERSION: u32 = 29;
+/// 28: in doubt where images stand together and share next to nothing. 29: and matches contradict that. 30: errors
+/// that neighbouring bearings share by all verified matches.
+pub const SCENE_VERSION: u32 = 30;
 /// Version of the search for the scene points nearest to a photo's features.
 pub const NEAREST_VERSION: u32 = setloc_index::VERSION;
 /// Version of single-photo localization.

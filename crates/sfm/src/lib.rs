@@ -35,7 +35,7 @@ pub use mapper::{
     InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,
     MergeVerdict, Mosaic, PutativePair, Recognition, RegistrationRecord, reconstruct,
 };
-pub use model_errors::{BearingField, ModelErrors, PoseDeviation};
+pub use model_errors::{BearingField, ModelErrors, PoseDeviation, shared_sigma_of_matches};
 pub use quality::{
     OutvotedPair, PairDisagreement, QualityParams, QualityReport, SuspiciousNeighbours, assess,
     doubtful_images,

@@ -22,10 +22,12 @@ use serde::{Deserialize, Serialize};
 use setloc_features::Camera;
 
 mod local;
+mod matched;
 mod shared;
 mod stitching;
 
 use self::local::LocalStretch;
+pub use self::matched::shared_sigma_of_matches;
 pub use self::shared::BearingField;
 use self::shared::shared_sigma_rad;
 use self::stitching::{OwnCameras, SharedStitching, draw_priors, move_places};
@@ -73,8 +75,13 @@ impl ModelErrors {
     /// Intrinsics stay as they are, but for how panoramas are stretched: that was told by the same bearings. What whole
     /// hemispheres share besides is not in it, as the poses take it up; nor is a fold.
     ///
-    /// `positions` are those that it was adjusted to, too; what *all* of them are off is in no draw.
-    pub fn of_model(model: &Reconstruction, positions: Option<&MeasuredPositions>) -> Option<Self> {
+    /// `positions` are those that it was adjusted to, too; what *all* of them are off is in no draw. `by_matches` is what its verified
+    /// matches show of errors that neighbouring bearings share ([`shared_sigma_of_matches`]), in radians.
+    pub fn of_model(
+        model: &Reconstruction,
+        positions: Option<&MeasuredPositions>,
+        by_matches: f64,
+    ) -> Option<Self> {
         let images: Vec<ImageId> = model.registered().collect();
         if shares_standpoints(model, &images) {
             return None;
@@ -90,7 +97,7 @@ impl ModelErrors {
         if problem.observations.is_empty() || !bundle::step(&mut unmoved) {
             return None;
         }
-        let shared_sigma_rad = shared_sigma_rad(model);
+        let shared_sigma_rad = shared_sigma_rad(model).max(by_matches);
         let own = OwnCameras::of(model);
         let shared_stitching = SharedStitching::of(&problem, &own);
         let of_draw = |draw: u32| {
@@ -340,7 +347,7 @@ mod tests {
     }
 
     /// The same of so many panoramas, as it truly is.
-    fn seen_street(
+    pub(super) fn seen_street(
         count: u32,
         camera: &Camera,
         noise_px: f64,
@@ -403,7 +410,7 @@ mod tests {
 
     #[test]
     fn what_has_no_places_has_no_errors() {
-        assert_eq!(ModelErrors::of_model(&Reconstruction::default(), None), None);
+        assert_eq!(ModelErrors::of_model(&Reconstruction::default(), None, 0.0), None);
     }
 
     #[test]
@@ -438,7 +445,7 @@ mod tests {
     ) -> [f64; 2] {
         let (mut squared, mut expected) = ([0.0; 2], [0.0; 2]);
         for (model, truth) in models {
-            let errors = ModelErrors::of_model(&model, None).expect("has places");
+            let errors = ModelErrors::of_model(&model, None, 0.0).expect("has places");
             check(&errors);
             let estimated = model.images.iter().map(|image| image.world_from_camera.unwrap());
             let pairs: Vec<(Rigid, Rigid)> = estimated.zip(truth).collect();
@@ -498,7 +505,7 @@ mod tests {
             apart += adjusted(None).1;
             let (model, squared) = adjusted(Some(&positions));
             held += squared;
-            let errors = ModelErrors::of_model(&model, Some(&positions)).expect("has places");
+            let errors = ModelErrors::of_model(&model, Some(&positions), 0.0).expect("has places");
             let stated =
                 |image| errors.deviation(&model, ImageId(image)).expect("is registered").center.powi(2);
             ratio += squared / ((0..60).map(stated).sum::<f64>() / 60.0) / 3.0;
@@ -521,7 +528,7 @@ mod tests {
             .collect();
         let positions = MeasuredPositions { params: params.clone(), by_image: measured };
         let [with, without] = [Some(&positions), None].map(|positions| {
-            let errors = ModelErrors::of_model(&model, positions).expect("has places");
+            let errors = ModelErrors::of_model(&model, positions, 0.0).expect("has places");
             let stated = |image| errors.deviation(&model, ImageId(image)).expect("is registered");
             let stated: Vec<PoseDeviation> = (0..6).map(stated).collect();
             let mean = |of: fn(&PoseDeviation) -> f64| stated.iter().map(of).sum::<f64>() / 6.0;
@@ -583,7 +590,7 @@ mod tests {
         let (mut squared, mut expected) = (0.0, 0.0);
         for seed in 0..6 {
             let (model, _) = street_of(&camera, 0.2, 4e-4, seed);
-            let errors = ModelErrors::of_model(&model, None).expect("are shown");
+            let errors = ModelErrors::of_model(&model, None, 0.0).expect("are shown");
             squared += apart(&model.cameras[0], &camera);
             for draw in 0..errors.draws() {
                 let drawn = &errors.cameras[draw as usize][0];

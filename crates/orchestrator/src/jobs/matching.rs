@@ -34,7 +34,7 @@ pub(super) fn is_swapped(images: &[SourceImage], a: usize, b: usize) -> bool {
 }
 
 /// The jobs of one pair.
-#[derive(Clone, Copy)]
+#[derive(Debug, Clone, Copy)]
 pub(super) struct PairJobs {
     pub matches: JobId,
     pub verified: JobId,

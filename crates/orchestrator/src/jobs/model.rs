@@ -14,7 +14,7 @@ use setloc_sfm::{
 
 use super::alignment::{KnownOfModel, add_alignment};
 use super::features::{Looks, accept_features, add_features_of, features_role};
-use super::matching::{PairSource, add_pair, is_swapped};
+use super::matching::{PairJobs, PairSource, add_pair, is_swapped};
 use super::positions::Measurements;
 use crate::artifacts::{PairMatches, VerifiedPair};
 use crate::config::Config;
@@ -43,6 +43,18 @@ pub struct ModelJobs {
     pub model: JobId,
     /// The positions that place it and that it is adjusted to.
     pub(super) measured: Measurements,
+    /// Its pairs.
+    pub(super) pairs: Vec<ModelPair>,
+}
+
+/// A pair of a model's images, which are places in the list of them.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ModelPair {
+    first: usize,
+    second: usize,
+    /// Whether its jobs list the second image first.
+    is_swapped: bool,
+    jobs: PairJobs,
 }
 
 /// What a model is made of.
@@ -74,8 +86,9 @@ pub fn add_model(
         ModelKind::Local => Looks::once(add_features_of(graph, images, &config.photo_features())),
     };
     let mut pairs = Vec::new();
-    for &(a, b) in chosen {
-        pairs.push((a, b, add_pair(graph, PairSource { images, config, seed }, &looks, (a, b))));
+    for &(first, second) in chosen {
+        let jobs = add_pair(graph, PairSource { images, config, seed }, &looks, (first, second));
+        pairs.push(ModelPair { first, second, is_swapped: is_swapped(images, first, second), jobs });
     }
     let features = looks.last;
     let cameras = share_cameras(images);
@@ -98,10 +111,9 @@ pub fn add_model(
     let measured =
         Measurements { params: config.georegistration.clone(), positions: positions.to_vec(), seed };
     let of_model = measured.clone();
-    let pair_list: Vec<(usize, usize, bool)> =
-        pairs.iter().map(|&(a, b, _)| (a, b, is_swapped(images, a, b))).collect();
+    let of_model_pairs = pairs.clone();
     let work = move |inputs: &Inputs<'_, '_>| {
-        let input = ModelInput { cameras: &cameras, measured: &of_model, pairs: &pair_list };
+        let input = ModelInput { cameras: &cameras, measured: &of_model, pairs: &of_model_pairs };
         run_model(inputs, &stage, &input, seed)
     };
     let mapped = graph.add(Job {
@@ -114,9 +126,9 @@ pub fn add_model(
         work: Box::new(work),
     });
     accept_features(graph, mapped, &features);
-    for (a, b, used) in pairs {
-        graph.accept(mapped, pair_role(a, b), used.verified);
-        graph.accept(mapped, matches_role(a, b), used.matches);
+    accept_verified(graph, mapped, &pairs);
+    for pair in &pairs {
+        graph.accept(mapped, matches_role(pair), pair.jobs.matches);
     }
     let model = if config.alignment.enabled {
         let known = KnownOfModel { cameras: fixed, measured: measured.clone() };
@@ -124,15 +136,41 @@ pub fn add_model(
     } else {
         mapped
     };
-    Ok(ModelJobs { features, mapped, model, measured })
+    Ok(ModelJobs { features, mapped, model, measured, pairs })
 }
 
-fn pair_role(a: usize, b: usize) -> String {
-    format!("pair {a:04} {b:04}")
+fn pair_role(pair: &ModelPair) -> String {
+    format!("pair {:04} {:04}", pair.first, pair.second)
 }
 
-fn matches_role(a: usize, b: usize) -> String {
-    format!("matches {a:04} {b:04}")
+fn matches_role(pair: &ModelPair) -> String {
+    format!("matches {:04} {:04}", pair.first, pair.second)
+}
+
+/// Lets a job read the geometries of pairs.
+pub(super) fn accept_verified(graph: &mut JobGraph<'_>, job: JobId, pairs: &[ModelPair]) {
+    for pair in pairs {
+        graph.accept(job, pair_role(pair), pair.jobs.verified);
+    }
+}
+
+/// The geometries of pairs, whose images have these numbers in the model.
+pub(super) fn verified_of(
+    inputs: &Inputs<'_, '_>,
+    pairs: &[ModelPair],
+    id_of: &BTreeMap<usize, ImageId>,
+) -> Result<Vec<PairGeometry>> {
+    let mut geometries = Vec::new();
+    for pair in pairs {
+        let verified = inputs.find::<VerifiedPair>(&pair_role(pair))?;
+        let ids = (id_of.get(&pair.first), id_of.get(&pair.second));
+        let (Some(verified), (Some(&first), Some(&second))) = (verified, ids) else { continue };
+        for two_view in &verified.0 {
+            let two_view = if pair.is_swapped { two_view.flipped() } else { two_view.clone() };
+            geometries.push(PairGeometry { first, second, two_view });
+        }
+    }
+    Ok(geometries)
 }
 
 /// Cameras shared by the images that have the same one.
@@ -187,7 +225,7 @@ struct ModelConfig {
 struct ModelInput<'a> {
     cameras: &'a SharedCameras,
     measured: &'a Measurements,
-    pairs: &'a [(usize, usize, bool)],
+    pairs: &'a [ModelPair],
 }
 
 fn run_model(
@@ -206,20 +244,14 @@ fn run_model(
             features.push((at, found));
         }
     }
-    let (mut pairs, mut putative) = (Vec::new(), Vec::new());
-    for &(a, b, swapped) in input.pairs {
-        let matches = inputs.find::<PairMatches>(&matches_role(a, b))?;
-        if let (Some(matches), Some(&first), Some(&second)) = (matches, id_of.get(&a), id_of.get(&b)) {
-            let turned = |m: &Match| if swapped { m.swapped() } else { *m };
-            putative.push(PutativePair { first, second, matches: matches.0.iter().map(turned).collect() });
-        }
-        let verified = inputs.find::<VerifiedPair>(&pair_role(a, b))?;
-        if let (Some(verified), Some(&first), Some(&second)) = (verified, id_of.get(&a), id_of.get(&b)) {
-            for two_view in &verified.0 {
-                let two_view = if swapped { two_view.flipped() } else { two_view.clone() };
-                pairs.push(PairGeometry { first, second, two_view });
-            }
-        }
+    let mut pairs = verified_of(inputs, input.pairs, &id_of)?;
+    let mut putative = Vec::new();
+    for pair in input.pairs {
+        let matches = inputs.find::<PairMatches>(&matches_role(pair))?;
+        let ids = (id_of.get(&pair.first), id_of.get(&pair.second));
+        let (Some(matches), (Some(&first), Some(&second))) = (matches, ids) else { continue };
+        let turned = |m: &Match| if pair.is_swapped { m.swapped() } else { *m };
+        putative.push(PutativePair { first, second, matches: matches.0.iter().map(turned).collect() });
     }
     let names: Vec<String> = features.iter().map(|(at, _)| place_holder(*at)).collect();
     let images = features.iter().zip(&names).map(|((at, features), name)| InputImage {

@@ -8,7 +8,7 @@ use setloc_sfm::{MapperOutput, MeasuredPosition, ReconstructionImage};
 
 use super::choose_pairs;
 use super::features::{accept_features, features_role};
-use super::model::{ModelJobs, ModelKind, ModelSource, add_model, image_of_place_holder};
+use super::model::{ModelJobs, ModelKind, ModelSource, accept_verified, add_model, image_of_place_holder};
 use super::scene_file::SceneRecipe;
 use crate::artifacts::{LeftApart, SceneIndices};
 use crate::config::Config;
@@ -192,6 +192,7 @@ pub fn add_scene(graph: &mut JobGraph<'_>, inputs: SceneInputs<'_>) -> Result<Sc
         names: images.into_iter().map(|image| image.name).collect(),
         origin,
         measured: jobs.measured.clone(),
+        pairs: jobs.pairs.clone(),
         config: inputs.config.scene_toml()?,
     };
     let scene = add_scene_file(graph, recipe, &jobs, index);
@@ -247,6 +248,7 @@ fn add_scene_file(graph: &mut JobGraph<'_>, recipe: SceneRecipe, jobs: &ModelJob
     graph.require(scene, "model", jobs.model);
     graph.require(scene, "index", index);
     accept_features(graph, scene, &jobs.features);
+    accept_verified(graph, scene, &jobs.pairs);
     scene
 }
 

@@ -1,16 +1,19 @@
 //! Makes the scene file of a model.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use anyhow::Result;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use setloc_features::{ImageFeatures, Wgs84};
-use setloc_sfm::{ImageId, MapperOutput, MeasuredPosition, MergeRecord, ModelErrors, Reconstruction};
+use setloc_sfm::{
+    ImageId, MapperOutput, MeasuredPosition, MergeRecord, ModelErrors, Reconstruction,
+    shared_sigma_of_matches,
+};
 
 use super::accuracy::Accuracy;
 use super::features::features_role;
-use super::model::{image_of_place_holder, with_names};
+use super::model::{ModelPair, image_of_place_holder, verified_of, with_names};
 use super::notes::{Doubt, Recall, lengths_note, shared_errors_note, stretch_note, worst_recall};
 use super::positions::{self, Fix, Measurements};
 use crate::artifacts::SceneIndices;
@@ -28,6 +31,8 @@ pub(super) struct SceneRecipe {
     pub origin: Option<Wgs84>,
     /// Measured positions of the images.
     pub measured: Measurements,
+    /// Pairs of the images.
+    pub pairs: Vec<ModelPair>,
     /// All parameters of a scene, as TOML.
     pub config: String,
 }
@@ -35,7 +40,7 @@ pub(super) struct SceneRecipe {
 impl SceneRecipe {
     /// What the file depends on.
     pub fn params(&self) -> Value {
-        let Self { names, origin, measured, config } = self;
+        let Self { names, origin, measured, config, pairs: _ } = self;
         let mut params = json!({ "names": names, "origin": origin, "config": config });
         if origin.is_some() {
             params["positions"] = json!([measured.positions, measured.params]);
@@ -62,17 +67,18 @@ impl SceneRecipe {
             .zip(output.outvoted.iter().zip(&output.suspicious))
             .map(|(component, (outvoted, suspicious))| Doubt::of(component, outvoted, suspicious))
             .collect();
+        let shared_sigmas = self.shared_sigmas(inputs, &output)?;
         let errors: Vec<Option<ModelErrors>> = (output.components.iter())
-            .zip(&output.report.georegistrations)
-            .map(|(component, placed)| {
+            .zip(output.report.georegistrations.iter().zip(&shared_sigmas))
+            .map(|(component, (placed, shared))| {
                 let positions = self.measured.for_adjustment(component, placed.as_ref());
-                ModelErrors::of_model(component, positions.as_ref())
+                ModelErrors::of_model(component, positions.as_ref(), *shared)
             })
             .collect();
         let mut scene = SceneFile {
             indices: indices_of_file,
             placed: placed.into_iter().map(|is_placed| is_placed && origin.is_some()).collect(),
-            content: content(inputs, &output)?,
+            content: content(inputs, &output, &shared_sigmas)?,
             features: features?,
             config: self.config.clone(),
             components,
@@ -86,6 +92,22 @@ impl SceneRecipe {
         };
         (scene.warnings, scene.notes) = self.said_of(&output, &doubts, &scene);
         Ok(scene)
+    }
+
+    /// What the verified matches of each component show of errors that neighbouring bearings share.
+    fn shared_sigmas(&self, inputs: &Inputs<'_, '_>, output: &MapperOutput) -> Result<Vec<f64>> {
+        let Some(main) = output.components.first() else { return Ok(Vec::new()) };
+        // All components list the same images.
+        let (mut id_of, mut features) = (BTreeMap::new(), Vec::new());
+        for (id, image) in main.images.iter().enumerate() {
+            let at = image_of_place_holder(&image.name).unwrap_or_default();
+            id_of.insert(at, ImageId(id as u32));
+            features.push(inputs.get::<ImageFeatures>(&features_role(at))?);
+        }
+        let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
+        let pairs = verified_of(inputs, &self.pairs, &id_of)?;
+        let sigma = |component| shared_sigma_of_matches(component, &features, &pairs);
+        Ok(output.components.iter().map(sigma).collect())
     }
 
     /// Whether any measured position has a height.
@@ -136,9 +158,10 @@ impl SceneRecipe {
 }
 
 /// A hash of what a scene is made of, whatever its images are called.
-fn content(inputs: &Inputs<'_, '_>, output: &MapperOutput) -> Result<ContentHash> {
+fn content(inputs: &Inputs<'_, '_>, output: &MapperOutput, shared_sigmas: &[f64]) -> Result<ContentHash> {
     let made_by = ContentHash::of(&stages::SCENE_VERSION.to_le_bytes());
     let mut content = vec![inputs.hash("model")?, inputs.hash("index")?, made_by];
+    content.extend(shared_sigmas.iter().map(|sigma| ContentHash::of(&sigma.to_le_bytes())));
     for image in output.components.iter().take(1).flat_map(|model| &model.images) {
         let at = image_of_place_holder(&image.name).unwrap_or_default();
         content.push(inputs.hash(&features_role(at))?);

@@ -15,18 +15,18 @@ use crate::synthetic::normal;
 use crate::{ImageId, Reconstruction, ReconstructionPoint};
 
 /// Angles in radians between directions whose residuals are compared: nearer ones share pixels of their patches.
-const APART: [f64; 2] = [0.026, 0.087];
+pub(super) const APART: [f64; 2] = [0.026, 0.087];
 /// Fewest views of a point. Two leave it one residual, along which nothing is told of the rest.
 const MIN_VIEWS: usize = 3;
 /// Fewest pairs of neighbours that tell anything.
-const MIN_PAIRS: usize = 200;
+pub(super) const MIN_PAIRS: usize = 200;
 /// Residuals of so many times the median are those of wrong places.
 const MAX_RESIDUAL: f64 = 4.0;
 /// Most images whose residuals are compared.
-const MAX_IMAGES: usize = 64;
+pub(super) const MAX_IMAGES: usize = 64;
 /// Share of the residuals' variance from which on shared errors matter beside those that are not: up to 0.01 in rendered
 /// scenes of twenty panoramas, 0.04 in one of eight, 0.06 and 0.3 in two real ones.
-const MIN_SHARE: f64 = 0.05;
+pub(super) const MIN_SHARE: f64 = 0.05;
 
 /// Waves that a field is the sum of.
 const WAVES: usize = 24;
@@ -153,21 +153,28 @@ fn variances(model: &Reconstruction) -> Option<Variances> {
     (shared.count >= MIN_PAIRS).then(|| Variances { shared: shared.value(), all: all.value() })
 }
 
+/// A weighted mean.
 #[derive(Default)]
-struct Mean {
-    sum: f64,
+pub(super) struct Mean {
+    pub sum: f64,
     weight: f64,
-    count: usize,
+    pub count: usize,
 }
 
 impl Mean {
-    fn add(&mut self, value: f64, weight: f64) {
+    pub fn add(&mut self, value: f64, weight: f64) {
         self.sum += value;
         self.weight += weight;
         self.count += 1;
     }
 
-    fn value(&self) -> f64 {
+    pub fn join(&mut self, other: &Self) {
+        self.sum += other.sum;
+        self.weight += other.weight;
+        self.count += other.count;
+    }
+
+    pub fn value(&self) -> f64 {
         self.sum / self.weight
     }
 }
