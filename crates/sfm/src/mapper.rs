@@ -71,13 +71,13 @@ use self::{
     standpoint::Standpoints,
     stitching::measure_stitching,
     structure::{PointLimits, complete_and_merge, filter, triangulate_image, triangulate_match},
-    told::correct_told,
+    told::{correct_told, said_of_corrections},
     witnesses::Witnesses,
 };
 use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind, bundle::BundleParams};
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 61;
+pub const MAPPER_VERSION: u32 = 62;
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///
@@ -85,13 +85,14 @@ pub const MAPPER_VERSION: u32 = 61;
 /// with the first baseline as unit of length, until it is georegistered.
 ///
 /// Where images turn out not to share the camera that they were given as one, they are mapped again with several, unless it is
-/// known or a bare guess: see [`MapperOutput::components`] and [`MapperReport::doubtful`]. Focal lengths that are told and that the
-/// largest component contradicts are replaced, and all is mapped again: see [`MapperParams::correct_told`].
+/// known or a bare guess: see [`MapperOutput::components`] and [`MapperReport::doubtful`]. Intrinsics that are told and that the
+/// largest component contradicts are replaced, and all is mapped again: see [`MapperParams::correct_told`] and
+/// [`MapperParams::calibrate_photos`].
 pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> MapperOutput {
     let mut output = reconstruct_with(params, input, seed);
     let mut used = input.clone();
     for _ in 0..MAX_CORRECTIONS {
-        let Some(largest) = output.components.first().filter(|_| params.correct_told) else { break };
+        let Some(largest) = output.components.first() else { break };
         let Some(corrected) = correct_told(params, (input, &used), largest) else { break };
         let again = reconstruct_with(params, &corrected, seed);
         if (registered_in(&again) as f64) < MIN_KEPT * registered_in(&output) as f64 {
@@ -111,6 +112,9 @@ pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) ->
         again.report.doubtful.clone_from(&output.report.doubtful);
         (output, used) = (again, divided);
     }
+    if params.calibrate_photos {
+        output.report.warnings.extend(said_of_corrections(input, &used.cameras));
+    }
     output
 }
 
@@ -119,7 +123,7 @@ fn registered_in(output: &MapperOutput) -> usize {
     output.components.first().map_or(0, |component| component.registered().count())
 }
 
-/// How often images are mapped again with other focal lengths than they are told.
+/// How often images are mapped again with other intrinsics than they are told.
 const MAX_CORRECTIONS: usize = 2;
 /// How often images are mapped again with other cameras.
 const MAX_DIVISIONS: usize = 2;

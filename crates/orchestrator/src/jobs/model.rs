@@ -97,6 +97,7 @@ pub fn add_model(
     let mapper = MapperParams {
         continue_planes: config.sfm.continue_planes && kind == ModelKind::Local,
         correct_told: config.sfm.correct_told && kind == ModelKind::Local,
+        calibrate_photos: config.sfm.calibrate_photos && kind == ModelKind::Scene,
         ..config.sfm.clone()
     };
     let params = json!({

@@ -119,6 +119,8 @@ const UNUSUAL: f64 = 2.0;
 
 /// Deviation of focal lengths that are not told apart, as a share.
 const ALIKE_FOCAL: f64 = 0.01;
+/// Share by which a term of distortion that is told may move the corners of an image otherwise.
+const AT_CORNER: f64 = 0.005;
 
 impl CameraPrior {
     /// What holds for the usual photo, as standard deviations: the principal point lies within 0.5 % of the longer side of
@@ -167,16 +169,27 @@ impl CameraPrior {
         Some(prior)
     }
 
-    /// That the focal lengths are within 1 % of this camera's, as a calibration tells them, and their ratio within 0.1 %.
+    /// That the focal lengths are within 1 % of this camera's, as a calibration tells them, and their ratio within 0.1 %; that no radial
+    /// term moves the corners by more than 0.5 % otherwise than it tells, and tangential terms are within 0.001.
     ///
     /// A calibration is made at one focus and one temperature. Pixels of another ratio than 1 are looser by what they differ.
     pub fn told(index: u32, camera: &Camera) -> Self {
-        let known = |(role, &value): (&ParamRole, &f64)| {
-            let sigma = if *role == ParamRole::Focal { ALIKE_FOCAL * value } else { f64::INFINITY };
+        let corner = f64::from(camera.width).hypot(f64::from(camera.height)) / 2.0 / camera.focal_length();
+        let known = |((role, name), &value): ((&ParamRole, &&str), &f64)| {
+            let sigma = match (role, *name) {
+                (ParamRole::Focal, _) => ALIKE_FOCAL * value,
+                (ParamRole::Distortion, "p1" | "p2") => 0.001,
+                (ParamRole::Distortion, "k" | "k1") => AT_CORNER / corner.powi(2),
+                (ParamRole::Distortion, "k2") => AT_CORNER / corner.powi(4),
+                (ParamRole::Distortion, "k3") => AT_CORNER / corner.powi(6),
+                (ParamRole::Distortion, _) => AT_CORNER / corner.powi(8),
+                _ => f64::INFINITY,
+            };
             ParameterEstimate { value, sigma }
         };
         let roles = camera.param_roles();
-        let parameters = roles.iter().zip(&camera.params).map(known).collect();
+        let named = roles.iter().zip(camera.model.param_names());
+        let parameters = named.zip(&camera.params).map(known).collect();
         let focal = roles.iter().zip(&camera.params).filter(|(role, _)| **role == ParamRole::Focal);
         let [shortest, longest] = focal
             .map(|(_, focal)| *focal)

@@ -28,8 +28,13 @@ pub(super) enum Intrinsics {
     None,
     /// Those that are not known.
     Unknown,
-    /// The focal lengths of this camera, which are told.
-    Told(usize),
+    /// Those of this camera, which are told: its focal lengths, and its distortion where that has to be in the model's camera.
+    Told {
+        /// The camera.
+        camera: usize,
+        /// Whether its distortion is asked for, too.
+        distortion: bool,
+    },
 }
 
 impl Scope {
@@ -111,9 +116,12 @@ pub(super) fn adjust(model: &mut Model<'_>, params: &BundleParams, scope: &Scope
                 }
             }
         }
-        Intrinsics::Told(camera) => {
-            problem.camera_freedom[camera] = IntrinsicsFreedom { focal: true, ..IntrinsicsFreedom::FIXED };
-            problem.camera_priors.push(CameraPrior::told(camera as u32, &model.input.cameras[camera]));
+        Intrinsics::Told { camera, distortion } => {
+            problem.camera_freedom[camera] =
+                IntrinsicsFreedom { focal: true, distortion, ..IntrinsicsFreedom::FIXED };
+            let told = model.input.cameras[camera].clone();
+            let told = if distortion { told.with_tangential_distortion() } else { told };
+            problem.camera_priors.push(CameraPrior::told(camera as u32, &told));
         }
     }
 

@@ -63,6 +63,9 @@ pub struct MapperParams {
     /// Whether photos are asked for the focal lengths that they are told, and have others, a percent off, where these explain
     /// the model clearly better. It applies to local models of photo sets only.
     pub correct_told: bool,
+    /// Whether photos are asked for the intrinsics that they are told, and have other focal lengths and distortion where these
+    /// explain the model clearly better. It applies to scenes only.
+    pub calibrate_photos: bool,
     /// Whether panoramas are asked how their stitching stretches directions ([`CameraModel::StitchedEquirectangular`]), and
     /// have that taken out where it explains the model clearly better.
     ///
@@ -95,6 +98,7 @@ impl Default for MapperParams {
             continue_planes: true,
             join_by_depths: true,
             correct_told: true,
+            calibrate_photos: true,
             calibrate_panoramas: true,
         }
     }

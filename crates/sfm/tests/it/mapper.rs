@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{UnitQuaternion, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use setloc_features::{
@@ -431,31 +431,70 @@ fn the_unknown_focal_length_and_distortion_of_photos_are_found() {
     assert!(worst_m < 0.05, "{worst_m} m");
 }
 
+/// Thirty photos of this camera on the way along a street, looking to one side.
+fn photos_of_a_street(camera: &Camera) -> Street {
+    let views = (0..30).map(|k| {
+        let yaw = 1.0 + 0.35 * (0.9 * f64::from(k)).sin();
+        let center = Vector3::new(1.5 * f64::from(k).sin(), 0.1 * f64::from(k % 3), 1.5 * f64::from(k));
+        (camera.clone(), Rigid::new(UnitQuaternion::from_euler_angles(0.0, yaw, 0.0), center))
+    });
+    // The noise that the keypoints state.
+    Street::new(views.collect(), 1.0, 0, 3)
+}
+
+/// The camera that a street's photos show where they are told this one, the largest error in metres, and what is said of it.
+fn found_of_told(street: &Street, told: &Camera, params: &MapperParams) -> (Camera, f64, Vec<String>) {
+    let told = vec![told.clone(); street.features.len()];
+    let output = street.map_pairs(params, &told, Calibration::Known, &street.verified_pairs(&told));
+    let (registered, worst_m, _) = street.errors(&output);
+    assert_eq!(registered, told.len());
+    (output.components[0].cameras[0].clone(), worst_m, output.report.warnings)
+}
+
 #[test]
 fn focal_lengths_that_are_told_two_percent_wrong_are_corrected_and_right_ones_kept() {
     let camera = |focal: f64| radial(1600, 1200, focal, [-0.05, 0.01]);
     let truth = camera(1250.0);
-    let views = (0..30).map(|k| {
-        let yaw = 1.0 + 0.35 * (0.9 * f64::from(k)).sin();
-        let center = Vector3::new(1.5 * f64::from(k).sin(), 0.1 * f64::from(k % 3), 1.5 * f64::from(k));
-        (truth.clone(), Rigid::new(UnitQuaternion::from_euler_angles(0.0, yaw, 0.0), center))
-    });
-    // The noise that the keypoints state.
-    let street = Street::new(views.collect(), 1.0, 0, 3);
-    let found = |told: &Camera| {
-        let output = street.map(&vec![told.clone(); 30], Calibration::Known);
-        let (registered, worst_m, _) = street.errors(&output);
-        assert_eq!(registered, 30);
-        (output.components[0].cameras[0].clone(), worst_m)
-    };
-    let (corrected, worst_m) = found(&camera(1275.0));
+    let street = photos_of_a_street(&truth);
+    let of_a_set = MapperParams { calibrate_photos: false, ..MapperParams::default() };
+    let found = |told: &Camera| found_of_told(&street, told, &of_a_set);
+    let (corrected, worst_m, _) = found(&camera(1275.0));
     assert!((corrected.focal_length() / 1250.0 - 1.0).abs() < 1e-3, "{corrected:?}");
     assert_eq!(corrected.params[1..], truth.params[1..]);
-    let (kept, at_best_m) = found(&truth);
+    let (kept, at_best_m, _) = found(&truth);
     assert_eq!(kept, truth);
     assert!(worst_m < 1.5 * at_best_m, "{worst_m} m, {at_best_m} m where it is told rightly");
     // What is a tenth off is no matter of calibration.
     assert_eq!(found(&camera(1375.0)).0, camera(1375.0));
+}
+
+#[test]
+fn photos_of_a_scene_that_are_told_free_of_distortion_and_are_not_are_calibrated() {
+    let truth = radial(1600, 1200, 1250.0, [-0.02, 0.0]);
+    let street = photos_of_a_street(&truth);
+    let found = |told: &Camera| found_of_told(&street, told, &MapperParams::default());
+    let pinhole = |focal: f64| Camera {
+        model: CameraModel::Pinhole,
+        width: 1600,
+        height: 1200,
+        params: vec![focal, focal, 800.0, 600.0],
+    };
+    let (calibrated, worst_m, said) = found(&pinhole(1257.0));
+    assert_eq!(calibrated.model, CameraModel::Opencv);
+    let off_at_corner = |camera: &Camera| {
+        let ray = |camera: &Camera| camera.unproject(&Vector2::new(1600.0, 1200.0)).unwrap();
+        ray(camera).angle(&ray(&truth))
+    };
+    let (now, before) = (off_at_corner(&calibrated), off_at_corner(&pinhole(1257.0)));
+    assert!(now < before / 3.0, "{now} rad, {before} rad as told");
+    assert!(said.iter().any(|line| line.contains("29 more photos contradict the intrinsics")), "{said:?}");
+    let (kept, at_best_m, said) = found(&truth);
+    assert_eq!((&kept, said.len()), (&truth, 0));
+    assert!(worst_m < 1.5 * at_best_m, "{worst_m} m, {at_best_m} m where it is told rightly");
+    let as_told = MapperParams { calibrate_photos: false, correct_told: false, ..MapperParams::default() };
+    let (kept, bent_m, _) = found_of_told(&street, &pinhole(1257.0), &as_told);
+    assert_eq!(kept, pinhole(1257.0));
+    assert!(bent_m > 2.0 * worst_m, "{bent_m} m as told, {worst_m} m");
 }
 
 #[test]
