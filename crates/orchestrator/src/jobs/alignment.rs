@@ -12,8 +12,8 @@ use setloc_sfm::{
     sharpen_lengths,
 };
 
-use super::features::{accept_features, features_role, read_unchanged};
-use super::model::image_of_place_holder;
+use super::features::{accept_features, read_unchanged};
+use super::model::{features_at, image_of_place_holder};
 use super::positions::Measurements;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
@@ -83,10 +83,7 @@ fn run_alignment(
         let at = image_of_place_holder(&image.name).filter(|at| *at < sources.len());
         image_at.push(at.with_context(|| format!("the model names an unknown image {}", image.name))?);
     }
-    let mut features = Vec::new();
-    for at in &image_at {
-        features.push(inputs.get::<ImageFeatures>(&features_role(*at))?);
-    }
+    let features = features_at(inputs, &image_at)?;
     let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
     let mut waiting = output.waiting_among(&output.open_pairs);
     for (component, placed) in output.components.iter_mut().zip(&mut output.report.georegistrations) {

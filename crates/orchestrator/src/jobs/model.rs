@@ -318,6 +318,17 @@ pub(super) fn image_of_place_holder(text: &str) -> Option<usize> {
     text.strip_prefix('⟦')?.strip_suffix('⟧')?.parse().ok()
 }
 
+/// Which images the numbers of a model's images stand for, as places in the list of images; all its components list the same.
+pub(super) fn places_of_images(model: &MapperOutput) -> Vec<usize> {
+    let images = model.components.first().map_or(&[][..], |component| &component.images);
+    images.iter().map(|image| image_of_place_holder(&image.name).unwrap_or_default()).collect()
+}
+
+/// The features of images at these places.
+pub(super) fn features_at(inputs: &Inputs<'_, '_>, places: &[usize]) -> Result<Vec<Arc<ImageFeatures>>> {
+    places.iter().map(|at| inputs.get(&features_role(*at))).collect()
+}
+
 /// Puts names where place holders stand.
 pub(super) fn with_names(text: &str, names: &[String]) -> String {
     let mut parts = text.split('⟦');

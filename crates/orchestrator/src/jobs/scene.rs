@@ -7,8 +7,11 @@ use setloc_index::SceneIndex;
 use setloc_sfm::{MapperOutput, MeasuredPosition, ReconstructionImage};
 
 use super::choose_pairs;
-use super::features::{accept_features, features_role};
-use super::model::{ModelJobs, ModelKind, ModelSource, accept_verified, add_model, image_of_place_holder};
+use super::features::accept_features;
+use super::model::{
+    ModelJobs, ModelKind, ModelSource, accept_verified, add_model, features_at, image_of_place_holder,
+    places_of_images,
+};
 use super::scene_file::SceneRecipe;
 use crate::artifacts::{LeftApart, SceneIndices};
 use crate::config::Config;
@@ -209,12 +212,7 @@ fn add_index(graph: &mut JobGraph<'_>, config: &Config, jobs: &ModelJobs) -> Res
     let params = config.index.clone();
     let work = move |inputs: &Inputs<'_, '_>| {
         let output = inputs.get::<MapperOutput>("model")?;
-        let mut features = Vec::new();
-        // All components list the same images.
-        for image in output.components.first().iter().flat_map(|model| &model.images) {
-            let at = image_of_place_holder(&image.name).unwrap_or_default();
-            features.push(inputs.get::<ImageFeatures>(&features_role(at))?);
-        }
+        let features = features_at(inputs, &places_of_images(&output))?;
         let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
         let index = |model| SceneIndex::build(&params, model, &features);
         Product::new(SceneIndices(output.components.iter().map(index).collect()))

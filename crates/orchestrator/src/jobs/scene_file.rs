@@ -1,6 +1,6 @@
 //! Makes the scene file of a model.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use anyhow::Result;
 use rayon::prelude::*;
@@ -13,7 +13,9 @@ use setloc_sfm::{
 
 use super::accuracy::Accuracy;
 use super::features::features_role;
-use super::model::{ModelPair, image_of_place_holder, verified_of, with_names};
+use super::model::{
+    ModelPair, features_at, image_of_place_holder, places_of_images, verified_of, with_names,
+};
 use super::notes::{Doubt, Recall, lengths_note, shared_errors_note, stretch_note, worst_recall};
 use super::positions::{self, Fix, Measurements};
 use crate::artifacts::SceneIndices;
@@ -96,15 +98,10 @@ impl SceneRecipe {
 
     /// What the verified matches of each component show of errors that neighbouring bearings share.
     fn shared_sigmas(&self, inputs: &Inputs<'_, '_>, output: &MapperOutput) -> Result<Vec<f64>> {
-        let Some(main) = output.components.first() else { return Ok(Vec::new()) };
-        // All components list the same images.
-        let (mut id_of, mut features) = (BTreeMap::new(), Vec::new());
-        for (id, image) in main.images.iter().enumerate() {
-            let at = image_of_place_holder(&image.name).unwrap_or_default();
-            id_of.insert(at, ImageId(id as u32));
-            features.push(inputs.get::<ImageFeatures>(&features_role(at))?);
-        }
+        let places = places_of_images(output);
+        let features = features_at(inputs, &places)?;
         let features: Vec<&ImageFeatures> = features.iter().map(|features| &**features).collect();
+        let id_of = places.iter().enumerate().map(|(id, at)| (*at, ImageId(id as u32))).collect();
         let pairs = verified_of(inputs, &self.pairs, &id_of)?;
         let sigma = |component| shared_sigma_of_matches(component, &features, &pairs);
         Ok(output.components.iter().map(sigma).collect())
@@ -162,8 +159,7 @@ fn content(inputs: &Inputs<'_, '_>, output: &MapperOutput, shared_sigmas: &[f64]
     let made_by = ContentHash::of(&stages::SCENE_VERSION.to_le_bytes());
     let mut content = vec![inputs.hash("model")?, inputs.hash("index")?, made_by];
     content.extend(shared_sigmas.iter().map(|sigma| ContentHash::of(&sigma.to_le_bytes())));
-    for image in output.components.iter().take(1).flat_map(|model| &model.images) {
-        let at = image_of_place_holder(&image.name).unwrap_or_default();
+    for at in places_of_images(output) {
         content.push(inputs.hash(&features_role(at))?);
     }
     Ok(ContentHash::of_all(&content))
