@@ -609,13 +609,7 @@ mod tests {
         assert_eq!(report.suspicious.len(), 1, "{report:?}");
         assert!(report.sentences(&model)[0].starts_with("a and b stand together"));
         assert!(!report.suspicious[0].is_confirmed);
-        let inliers = (0..60).map(|at| Match { first: at, second: at }).collect();
-        let two_view = TwoView {
-            kind: TwoViewKind::General,
-            second_from_first: Rigid::identity(),
-            inliers,
-            median_parallax_rad: 0.0,
-        };
+        let two_view = TwoView::of_equal_features(Rigid::identity(), 0..60);
         let pair = PairGeometry { first: ImageId(0), second: ImageId(1), two_view };
         assert!(assess(&QualityParams::default(), &model, &[], &[pair]).suspicious[0].is_confirmed);
         // So does a third that shares nothing with either.

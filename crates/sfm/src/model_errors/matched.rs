@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use setloc_features::{ImageFeatures, Rays};
 
 use super::shared::{APART, MAX_IMAGES, MIN_PAIRS, MIN_SHARE, Mean};
-use crate::{ImageId, PairGeometry, Reconstruction, TwoViewKind};
+use crate::{ImageId, PairGeometry, Reconstruction, TwoViewKind, robust::median};
 
 /// Rotation in radians between a pair and the model from which on the pair is not what the model shows.
 const MAX_ROTATION: f64 = 0.05;
@@ -50,15 +50,14 @@ pub fn shared_sigma_of_matches(
     features: &[&ImageFeatures],
     pairs: &[PairGeometry],
 ) -> f64 {
-    let rays = rays_of_matches(model, features, pairs);
+    let is_registered = |image: ImageId| model.images[image.index()].world_from_camera.is_some();
+    let within = |pair: &&PairGeometry| is_registered(pair.first) && is_registered(pair.second);
+    let pairs: Vec<&PairGeometry> = pairs.iter().filter(within).collect();
+    let rays = rays_of_matches(model, features, &pairs);
     let mut of_pairs: Vec<Vec<Miss>> = pairs.par_iter().map(|pair| misses(model, &rays, pair)).collect();
-    let median = |misses: &mut dyn Iterator<Item = &Miss>| -> f64 {
-        let mut sizes: Vec<f64> = misses.map(|miss| miss.off.abs()).collect();
-        let middle = sizes.len() / 2;
-        if sizes.is_empty() { 0.0 } else { *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 }
-    };
-    let usual = median(&mut of_pairs.iter().flatten());
-    of_pairs.retain(|misses| median(&mut misses.iter()) <= MAX_OF_PAIR * usual);
+    let sizes = |misses: &[Miss]| -> Vec<f64> { misses.iter().map(|miss| miss.off.abs()).collect() };
+    let Some(usual) = median(of_pairs.iter().flat_map(|misses| sizes(misses)).collect()) else { return 0.0 };
+    of_pairs.retain(|misses| median(sizes(misses)).is_some_and(|median| median <= MAX_OF_PAIR * usual));
     let mut of_images: Vec<Vec<Miss>> = model.images.iter().map(|_| Vec::new()).collect();
     for miss in of_pairs.into_iter().flatten().filter(|miss| miss.off.abs() <= MAX_MISS * usual) {
         of_images[miss.image.index()].push(miss);
@@ -82,7 +81,11 @@ pub fn shared_sigma_of_matches(
 }
 
 /// The bearings of the keypoints that are matched, by image.
-fn rays_of_matches(model: &Reconstruction, features: &[&ImageFeatures], pairs: &[PairGeometry]) -> Vec<Rays> {
+fn rays_of_matches(
+    model: &Reconstruction,
+    features: &[&ImageFeatures],
+    pairs: &[&PairGeometry],
+) -> Vec<Rays> {
     let mut matched: Vec<Vec<u32>> = model.images.iter().map(|_| Vec::new()).collect();
     for pair in pairs {
         matched[pair.first.index()].extend(pair.two_view.inliers.iter().map(|m| m.first));
