@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::Result;
 use setloc_camset::{AnywhereLocalization, PhotoLocalization, SetLocalization, Verdict};
 use setloc_features::{Calibration, Camera};
-use setloc_sfm::MapperOutput;
+use setloc_sfm::{CorrectedCamera, MOST_NAMED, MapperOutput, listed};
 
 use crate::building::{alike_pairs, estimate_cameras, has_guessed_cameras};
 use crate::config::Config;
@@ -90,6 +90,8 @@ pub fn best_answers<'a>(
 
 /// Locates photos; `target` is the photo that decides in [`Mode::Auto`].
 ///
+/// Photos of a camera whose told intrinsics the scene's own photos contradict have those that these show.
+///
 /// Where intrinsics of a set are a guess, the set is located twice: the second time with the cameras that the scene told the
 /// first time, which `folder` has afterwards. Before that, photos taken on one spot tell theirs, and guesses that do not hold are
 /// improved by a model of the photos.
@@ -105,7 +107,11 @@ pub fn locate(
     name: &str,
     target: &str,
 ) -> Result<Located> {
-    let (skipped, warnings) = (folder.skipped.clone(), folder.warnings.clone());
+    let (skipped, mut warnings) = (folder.skipped.clone(), folder.warnings.clone());
+    if what.config.sfm.calibrate_photos {
+        let corrected = correct_told(&mut folder.images, &what.scene.corrected);
+        warnings.extend(said_of_corrected(&corrected));
+    }
     let mut located = Located { skipped, warnings, ..Located::default() };
     let mut whole = RunResult::default();
     if matches!(mode, Mode::Auto | Mode::Single) {
@@ -167,6 +173,28 @@ pub fn locate(
     }
     session.remember(name, &whole);
     Ok(located)
+}
+
+/// Gives photos of cameras whose told intrinsics a scene contradicts those that it shows; their names.
+fn correct_told(images: &mut [SourceImage], corrections: &[CorrectedCamera]) -> Vec<String> {
+    let mut corrected = Vec::new();
+    for image in images.iter_mut().filter(|image| image.calibration == Calibration::Known) {
+        if let Some(correction) = corrections.iter().find(|correction| correction.told == image.camera) {
+            image.camera.clone_from(&correction.used);
+            corrected.push(image.name.clone());
+        }
+    }
+    corrected
+}
+
+fn said_of_corrected(names: &[String]) -> Option<String> {
+    (!names.is_empty()).then(|| {
+        format!(
+            "{}: told the intrinsics that the scene's photos contradict, and given those that these show \
+             (sfm.calibrate_photos = false keeps what is told)",
+            listed(names, MOST_NAMED)
+        )
+    })
 }
 
 /// Whether an image's camera is a guess that fewer than [`MIN_PHOTOS`] images share.
@@ -467,6 +495,28 @@ mod tests {
         let focal: Vec<f64> = told.iter().map(|image| image.camera.focal_length()).collect();
         assert_eq!(focal, [1500.0, 1200.0, 1200.0, 1920.0, 1111.0]);
         assert!(told[..3].iter().all(|image| image.calibration == Calibration::Guessed));
+    }
+
+    #[test]
+    fn photos_of_a_camera_that_the_scene_contradicts_have_what_it_shows() {
+        let [told, used, other] = [1000.0, 1010.0, 1200.0].map(|f| Camera::from_focal_guess(1600, 1200, f));
+        let image = |name: &str, camera: &Camera, calibration| SourceImage {
+            calibration,
+            ..SourceImage::guessed(name, camera.clone())
+        };
+        let mut images = [
+            image("a", &told, Calibration::Known),
+            image("b", &other, Calibration::Known),
+            image("c", &told, Calibration::Guessed),
+        ];
+        let corrections = [CorrectedCamera { told: told.clone(), used: used.clone() }];
+        assert_eq!(correct_told(&mut images, &corrections), ["a"]);
+        assert_eq!(images.each_ref().map(|image| &image.camera), [&used, &other, &told]);
+        assert_eq!(images[0].calibration, Calibration::Known);
+        // What they have now is no longer what they were told.
+        assert!(correct_told(&mut images, &corrections).is_empty());
+        assert_eq!(said_of_corrected(&[]), None);
+        assert!(said_of_corrected(&["a".to_owned()]).expect("one").starts_with("a: told the intrinsics"));
     }
 
     #[test]

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use setloc_camset::GrownImage;
 use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::{ImageId, ModelErrors, Reconstruction, Rigid};
+use setloc_sfm::{CorrectedCamera, ImageId, ModelErrors, Reconstruction, Rigid};
 
 use crate::codec::{self, Artifact};
 use crate::error::Hinted;
@@ -26,6 +26,8 @@ pub struct SceneFile {
     pub placed: Vec<bool>,
     /// Images of each component about which it may be wrong; ascending.
     pub doubtful: Vec<Vec<ImageId>>,
+    /// Cameras whose told intrinsics the images contradict; photos of the same camera are contradicted with them.
+    pub corrected: Vec<CorrectedCamera>,
     /// What each component may be off, where that is told.
     pub errors: Vec<Option<ModelErrors>>,
     /// Features of the images, by image id, as artifacts; empty where no component has registered an image. Photos that
@@ -48,7 +50,7 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 16);
+serde_artifact!(SceneFile, "scene", 17);
 
 /// Altitude of an origin where none was measured: heights are relative. A measured zero is positive.
 pub const NO_ALTITUDE: f64 = -0.0;

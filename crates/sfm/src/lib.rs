@@ -32,8 +32,8 @@ pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, Meas
 pub use ground::{register_by_ground, sharpen_lengths};
 pub use listing::{MOST_NAMED, listed};
 pub use mapper::{
-    InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport, MergeRecord,
-    MergeVerdict, Mosaic, PutativePair, Recognition, RegistrationRecord, reconstruct,
+    CorrectedCamera, InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport,
+    MergeRecord, MergeVerdict, Mosaic, PutativePair, Recognition, RegistrationRecord, reconstruct,
 };
 pub use model_errors::{BearingField, ModelErrors, PoseDeviation, shared_sigma_of_matches};
 pub use quality::{

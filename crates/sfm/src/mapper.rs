@@ -48,7 +48,7 @@ pub(crate) use self::corner::ln_false_alarms;
 pub use self::{
     input::{InputImage, MapperInput, PutativePair},
     merge::{MergeRecord, MergeVerdict, Recognition},
-    output::{MapperOutput, MapperReport, RegistrationRecord},
+    output::{CorrectedCamera, MapperOutput, MapperReport, RegistrationRecord},
     params::MapperParams,
     standpoint::Mosaic,
 };
@@ -71,13 +71,13 @@ use self::{
     standpoint::Standpoints,
     stitching::measure_stitching,
     structure::{PointLimits, complete_and_merge, filter, triangulate_image, triangulate_match},
-    told::{correct_told, said_of_corrections},
+    told::{correct_told, corrections, said_of_corrections},
     witnesses::Witnesses,
 };
 use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind, bundle::BundleParams};
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 62;
+pub const MAPPER_VERSION: u32 = 63;
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///
@@ -112,9 +112,11 @@ pub fn reconstruct(params: &MapperParams, input: &MapperInput<'_>, seed: u64) ->
         again.report.doubtful.clone_from(&output.report.doubtful);
         (output, used) = (again, divided);
     }
+    let corrected = corrections(input, &used.cameras);
     if params.calibrate_photos {
-        output.report.warnings.extend(said_of_corrections(input, &used.cameras));
+        output.report.warnings.extend(said_of_corrections(input, &corrected));
     }
+    output.corrected = corrected.into_values().collect();
     output
 }
 

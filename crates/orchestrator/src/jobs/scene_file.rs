@@ -85,6 +85,7 @@ impl SceneRecipe {
             config: self.config.clone(),
             components,
             doubtful: doubts.iter().map(Doubt::images).collect(),
+            corrected: output.corrected.clone(),
             errors,
             origin,
             warnings: Vec::new(),

@@ -1,6 +1,7 @@
 //! What comes of mapping, and what happened.
 
 use serde::{Deserialize, Serialize};
+use setloc_features::Camera;
 
 use super::{MergeRecord, register::Visibility};
 use crate::{
@@ -63,6 +64,15 @@ pub struct MapperReport {
     pub doubtful: Vec<CameraId>,
 }
 
+/// A camera whose told intrinsics its images contradict.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CorrectedCamera {
+    /// As it was told.
+    pub told: Camera,
+    /// As its images show it, and as it is used.
+    pub used: Camera,
+}
+
 /// Components, largest first, and the report.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct MapperOutput {
@@ -77,6 +87,8 @@ pub struct MapperOutput {
     pub outvoted: Vec<Vec<OutvotedPair>>,
     /// Images of each component that stand together and share nothing; none is known of components beyond the end.
     pub suspicious: Vec<Vec<SuspiciousNeighbours>>,
+    /// Cameras that are not used as they were told.
+    pub corrected: Vec<CorrectedCamera>,
     /// What happened.
     pub report: MapperReport,
 }
@@ -109,8 +121,6 @@ impl MapperOutput {
 
 #[cfg(test)]
 mod tests {
-    use setloc_features::Camera;
-
     use super::*;
     use crate::{ReconstructionImage, Rigid, TwoView};
 
