@@ -557,6 +557,26 @@ mod tests {
     }
 
     #[test]
+    fn a_photo_that_shows_more_alone_stands_as_it_does_alone() {
+        let world = World::chain(9, 0.2, 1);
+        let (alone, found) = locate_with_alone(&world, |alone| {
+            move_by(0.2)(&mut alone[1]);
+            alone[1].answer.photo.inliers *= 2;
+        });
+        assert_eq!(found.refined[1].world_from_camera, alone[1].answer.photo.world_from_camera);
+        assert_eq!(found.refined[1].verdict, Verdict::Localized);
+        assert_ne!(found.rigid[1].verdict, Verdict::Localized);
+        assert!(found.refined[1].reasons.join("; ").contains("scene points that it shows alone"));
+        assert!(found.contradicted.is_empty());
+        for (photo, alone) in found.refined.iter().zip(&alone) {
+            let is_held =
+                alone.answer.photo.verdict == Verdict::Localized || photo.verdict == Verdict::Localized;
+            assert!(is_held || photo.reasons.join("; ").contains("too few of the scene points"), "{photo:?}");
+        }
+        assert_ne!(found.refined[8].verdict, Verdict::Localized);
+    }
+
+    #[test]
     fn where_hardly_any_match_agrees_guided_matching_tells_the_pose() {
         let world = World::chain(6, 0.2, 1);
         // All but one in 60 scene points have another that is as like, for the ratio test.

@@ -308,6 +308,7 @@ impl Component<'_> {
         for slot in without_scale {
             refuse_without_scale(&mut rigid_answers[slot]);
         }
+        self.doubt_beside_lost(&joint, &mut refined, &mut rigid_answers);
         if is_distrusted {
             let is_outweighed = self.outweighed(&joint);
             let alone = (&mut elsewhere_alone[..], &is_outweighed[..]);

@@ -14,6 +14,9 @@ use crate::{PhotoLocalization, SceneMatch, Verdict};
 
 /// Share of the rigid pose's correspondences that the joint refinement has to bring within the inlier bound.
 const MIN_KEPT: f64 = 0.5;
+/// Share of the scene points that a photo shows alone that it has to show as its set places it. Of held-out photos of rendered and
+/// real places 0.98 and more are left where the set is right; 0.7 of one that a wrong relative pose drew aside, less of others.
+const MIN_KEPT_OF_ALONE: f64 = 0.8;
 /// Scene points that tell the focal length of a photo whose local model does not.
 const MIN_TELLING: usize = 30;
 
@@ -95,7 +98,13 @@ impl Component<'_> {
                     // joint refinement left behind.
                     Some(true) => {
                         reasons.push("localized alone, it stands at the same place".to_owned());
-                        if kept >= MIN_KEPT {
+                        let lost = self.lost_of_alone(joint, slot);
+                        if let Some((left, shown)) = lost {
+                            reasons.push(format!(
+                                "its set leaves {left} of the {shown} scene points that it shows alone"
+                            ));
+                        }
+                        if kept >= MIN_KEPT && lost.is_none() {
                             verdict = Verdict::Localized;
                         } else if let Some(alone) = self.localized_alone(slot) {
                             reasons.push(
@@ -147,6 +156,41 @@ impl Component<'_> {
         self.photos[photo].calibration != Calibration::Guessed
             || (0..self.members.len()).any(shares_it)
             || self.model.tells_camera_of(&[ImageId(photo as u32)])
+    }
+
+    /// How many scene points the set leaves a photo of those that it shows alone, and these, where that are too few: then its local
+    /// model is wrong about it, though not by so much that it stood elsewhere.
+    fn lost_of_alone(&self, joint: &Joint, slot: usize) -> Option<(usize, usize)> {
+        let (left, shown) = (joint.direct[slot].len(), self.localized_alone(slot)?.inliers);
+        ((left as f64) < MIN_KEPT_OF_ALONE * shown as f64).then_some((left, shown))
+    }
+
+    /// Makes photos uncertain that are held by nothing but a local model that loses what others of it show alone, and the rigid pose
+    /// of those others.
+    pub(super) fn doubt_beside_lost(
+        &self,
+        joint: &Joint,
+        refined: &mut [PhotoLocalization],
+        rigid: &mut [PhotoLocalization],
+    ) {
+        let slots = || 0..self.members.len();
+        let lost: Vec<usize> = slots().filter(|&slot| self.lost_of_alone(joint, slot).is_some()).collect();
+        let Some(&first) = lost.first() else { return };
+        let reason = format!(
+            "its local model leaves {} too few of the scene points that it shows alone",
+            self.photos[self.members[first]].name
+        );
+        let is_held = |slot: usize| {
+            self.localized_alone(slot).is_some()
+                || joint.direct[slot].len() + joint.viewed[slot] >= self.params.verdict.min_inliers
+        };
+        for slot in slots().filter(|&slot| !is_held(slot)) {
+            refined[slot].doubt(reason.clone());
+            rigid[slot].doubt(reason.clone());
+        }
+        for slot in lost {
+            rigid[slot].doubt(reason.clone());
+        }
     }
 
     /// What the photo alone says, where it is localized.
