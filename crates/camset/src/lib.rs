@@ -77,7 +77,7 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 48: photos among stitched panoramas err as these do; photos that the
 /// joint refinement leaves behind are where they are alone. 49: sets whose photos look otherwise than the scene are uncertain.
 /// 50: photos among stitched panoramas are stretched as windows of these are.
-pub const VERSION: u32 = 51;
+pub const VERSION: u32 = 52;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 /// 2: points shift to where moved rays meet.

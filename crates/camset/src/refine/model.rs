@@ -42,11 +42,14 @@ pub(crate) enum KnownOfCamera {
     Usual,
     /// That it differs from this one by little.
     Alike(Camera),
+    /// Its distortion and principal point: they stay. Of the focal length nothing.
+    Distortion,
     /// Its intrinsics but for the focal lengths, which are near this one's.
     AllButFocal(Camera),
 }
 
 impl JointCamera {
+    #[cfg(test)]
     pub fn new(camera: Camera, is_known: bool) -> Self {
         Self { camera, known: if is_known { KnownOfCamera::Intrinsics } else { KnownOfCamera::Usual } }
     }
@@ -59,7 +62,9 @@ impl JointCamera {
         match self.known {
             KnownOfCamera::Intrinsics => IntrinsicsFreedom::FIXED,
             KnownOfCamera::Usual | KnownOfCamera::Alike(_) => IntrinsicsFreedom::FREE,
-            KnownOfCamera::AllButFocal(_) => IntrinsicsFreedom { focal: true, ..IntrinsicsFreedom::FIXED },
+            KnownOfCamera::Distortion | KnownOfCamera::AllButFocal(_) => {
+                IntrinsicsFreedom { focal: true, ..IntrinsicsFreedom::FIXED }
+            }
         }
     }
 
@@ -68,7 +73,7 @@ impl JointCamera {
         match &self.known {
             KnownOfCamera::Alike(alike) => CameraPrior::alike(index, alike),
             KnownOfCamera::AllButFocal(near) => Some(CameraPrior::told(index, near)),
-            KnownOfCamera::Intrinsics | KnownOfCamera::Usual => {
+            KnownOfCamera::Intrinsics | KnownOfCamera::Usual | KnownOfCamera::Distortion => {
                 CameraPrior::of_usual_photo(index, &self.camera)
             }
         }
