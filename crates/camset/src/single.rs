@@ -1,15 +1,15 @@
-use std::collections::BTreeMap;
+mod fit;
 
-use nalgebra::{Matrix6, Vector2, Vector3};
-use setloc_features::{Camera, CameraModel};
+use nalgebra::{Matrix6, Vector3};
+use setloc_features::Camera;
 use setloc_index::{NearestPoints, SceneIndex};
-use setloc_sfm::robust::{RansacParams, estimate_absolute_pose, estimate_absolute_pose_focal};
-use setloc_sfm::{ImageId, Rigid};
+use setloc_sfm::Rigid;
+use setloc_sfm::robust::{RansacParams, estimate_absolute_pose};
 
+use self::fit::{Fit, Sought};
 use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
 use crate::guided::guided_matches;
-use crate::refine::{JointCamera, JointModel, JointObservations, JointPhoto, KnownOfCamera, refine_jointly};
-use crate::stretch::PhotoStretch;
+use crate::refine::{JointModel, JointObservations, refine_jointly};
 use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
 use crate::verdict::{Evidence, MIN_OFF_GROUND, judge_precision, judge_support, weaker};
@@ -19,23 +19,6 @@ use crate::{
 
 /// Points in a minimal sample of P3P.
 const SAMPLE: usize = 3;
-/// Factors on a guessed focal length, tried in turn where the intrinsics are not known.
-const FOCAL_FACTORS: [f64; 7] = [1.0, 0.84, 1.19, 0.71, 1.41, 0.56, 1.78];
-/// How many of them are fitted, best first.
-const MOST_FITTED: usize = 3;
-/// By which factors a focal length that is found is changed to see whether others show more, and how often.
-const FOCAL_STEP: f64 = 1.02;
-const MAX_FOCAL_STEPS: usize = 5;
-/// Matches that tell a focal length by themselves.
-const TELLING: usize = 200;
-/// Most samples of P4Pf: enough where every fifth match is right.
-const MAX_FOCAL_SAMPLES: u32 = 2000;
-/// Least and largest factor on it that P4Pf may find.
-const FOCAL_RANGE: (f64, f64) = (0.4, 2.5);
-
-/// How many times better a fisheye has to explain the matches than a lens without: it has two more terms, and a
-/// few matches more or less agree with any.
-const FISHEYE_GAIN: f64 = 1.1;
 
 /// A pose of one photo with everything that speaks for it.
 struct SinglePose {
@@ -123,12 +106,6 @@ pub(crate) fn locate_with_nearest(
     SingleAnswer { photo: answer, inliers: found.inliers }
 }
 
-struct Hypothesis {
-    camera: Camera,
-    pose: Rigid,
-    score: f64,
-}
-
 fn solve(
     params: &SingleParams,
     (scene, ground): (&Scene<'_>, &Ground),
@@ -137,11 +114,8 @@ fn solve(
     matches: &[SceneMatch],
     seed: u64,
 ) -> Option<SinglePose> {
-    let mut first = fit(params, (scene, ground), photo, matches, seed)?;
-    if !first.model.cameras[0].is_known() {
-        first = at_best_focal(params, (scene, ground, photo, matches), nearest, first, seed);
-    }
-    let Fit { mut model, agreeing, .. } = first;
+    let Fit { mut model, agreeing, .. } =
+        Sought { params, scene, ground, photo, matches, seed }.fit(nearest)?;
     let (camera, pose) = (model.camera_of(0).clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
     let depth =
@@ -203,138 +177,6 @@ fn solve(
     Some(SinglePose { camera, world_from_camera: pose, covariance, inliers, depth, evidence })
 }
 
-/// Camera and pose of one photo by its matches.
-struct Fit {
-    model: JointModel,
-    agreeing: Vec<SceneMatch>,
-    score: f64,
-}
-
-/// Camera and pose by the matches.
-///
-/// Where the intrinsics are not known, a wide lens is taken for a fisheye if that explains clearly more.
-fn fit(
-    params: &SingleParams,
-    (scene, ground): (&Scene<'_>, &Ground),
-    photo: &QueryPhoto<'_>,
-    matches: &[SceneMatch],
-    seed: u64,
-) -> Option<Fit> {
-    let given = (scene, ground, photo, matches);
-    let fitted = |camera, pose, known| fitted(params, given, camera, pose, known);
-    let tried = |cameras: &[Camera], seed| hypotheses(params, (scene, ground), photo, cameras, matches, seed);
-    if photo.calibration.is_settled() {
-        let only = tried(std::slice::from_ref(photo.camera), seed).into_iter().next()?;
-        return Some(fitted(only.camera, only.pose, KnownOfCamera::Intrinsics));
-    }
-    let likely: Vec<Camera> =
-        FOCAL_FACTORS.iter().map(|&factor| photo.camera.with_focal_times(factor)).collect();
-    let mut likely = tried(&likely, seed);
-    likely.truncate(MOST_FITTED);
-    likely.extend(by_focal_length(params, (scene, ground), photo, matches, seed ^ 0xf0ca));
-    // Few matches fit with distortion that no lens has, at a wrong distance, if that is free before the pose is about right.
-    let without = likely.into_iter().map(|found| fitted(found.camera, found.pose, KnownOfCamera::Distortion));
-    let usual = best_of(without).map(|without| {
-        let (camera, pose) = (without.model.camera_of(0).clone(), without.model.photos[0].world_from_camera);
-        let mut best = best_of([fitted(camera, pose, KnownOfCamera::Usual), without]).expect("there are two");
-        best.model.cameras[0].known = KnownOfCamera::Usual;
-        best
-    });
-    if photo.camera.model != CameraModel::Radial {
-        return usual;
-    }
-    let as_fisheye = |camera, pose| fitted(camera, pose, KnownOfCamera::Usual);
-    let guesses: Vec<Camera> = Camera::fisheye_guesses(photo.camera.width, photo.camera.height).collect();
-    let bent = usual.as_ref().and_then(|usual| {
-        Some(as_fisheye(usual.model.camera_of(0).as_fisheye()?, usual.model.photos[0].world_from_camera))
-    });
-    let guessed = tried(&guesses, seed ^ 0xf15e).into_iter().next();
-    let guessed = guessed.map(|found| as_fisheye(found.camera, found.pose));
-    let fisheyes = [guessed, bent].into_iter().flatten();
-    let fisheye = best_of(fisheyes.filter(|fit| fit.model.camera_of(0).is_wide()));
-    let score = |fit: &Option<Fit>| fit.as_ref().map_or(0.0, |fit| fit.score);
-    if score(&fisheye) > FISHEYE_GAIN * score(&usual) { fisheye } else { usual }
-}
-
-/// The pose, and the camera but for what is known of it, fitted to the matches that agree until no more do.
-fn fitted(
-    params: &SingleParams,
-    (scene, ground, photo, matches): (&Scene<'_>, &Ground, &QueryPhoto<'_>, &[SceneMatch]),
-    camera: Camera,
-    pose: Rigid,
-    known: KnownOfCamera,
-) -> Fit {
-    let mut model = JointModel {
-        cameras: vec![JointCamera { camera, known }],
-        photos: vec![JointPhoto { camera: 0, world_from_camera: pose, standpoint: 0 }],
-        points: Vec::new(),
-        lengths: Vec::new(),
-        stretch: PhotoStretch::of_one(scene),
-    };
-    let mut found = 0;
-    // With intrinsics free each refinement brings matches within the bound that the one before left just outside.
-    loop {
-        refine(&mut model, scene, photo, matches, params.max_error_sigmas, false);
-        let rays = PhotoRays::new(photo.features, model.camera_of(0));
-        let pose = model.photos[0].world_from_camera;
-        let agreeing = inliers(&rays, scene.index, &pose, matches, params.max_error_sigmas);
-        if model.cameras[0].is_known() || agreeing.len() <= found {
-            let score = score(params, (scene.index, ground), &rays, &pose, matches);
-            return Fit { model, agreeing, score };
-        }
-        found = agreeing.len();
-    }
-}
-
-/// The fit at the focal length nearby at which guided matching shows most of the scene.
-///
-/// What is far or flat fits a longer focal length and a step back about as well, and a few matches may agree better with those; but
-/// then fewer are found beside them.
-fn at_best_focal(
-    params: &SingleParams,
-    (scene, ground, photo, matches): (&Scene<'_>, &Ground, &QueryPhoto<'_>, &[SceneMatch]),
-    nearest: &[NearestPoints],
-    first: Fit,
-    seed: u64,
-) -> Fit {
-    let shown = |fit: &Fit| {
-        let (pose, rays) =
-            (fit.model.photos[0].world_from_camera, PhotoRays::new(photo.features, fit.model.camera_of(0)));
-        let guided = guided_matches(&params.guided, scene.index, &rays, nearest, &pose);
-        inliers(&rays, scene.index, &pose, &union(&fit.agreeing, &guided), params.max_error_sigmas).len()
-    };
-    let camera = first.model.camera_of(0).clone();
-    let known = first.model.cameras[0].known.clone();
-    let (mut most, mut best) = (shown(&first), first);
-    if most >= TELLING {
-        return best;
-    }
-    for step in [1.0 / FOCAL_STEP, FOCAL_STEP] {
-        let mut factor = step;
-        for _ in 0..MAX_FOCAL_STEPS {
-            let camera = [camera.with_focal_times(factor)];
-            let Some(tried) = hypotheses(params, (scene, ground), photo, &camera, matches, seed).pop() else {
-                break;
-            };
-            let given = (scene, ground, photo, matches);
-            let other = fitted(params, given, tried.camera, tried.pose, KnownOfCamera::Intrinsics);
-            let found = shown(&other);
-            if found <= most {
-                break;
-            }
-            (most, best) = (found, other);
-            factor *= step;
-        }
-    }
-    best.model.cameras[0].known = known;
-    best
-}
-
-/// The one of greatest score; of equals the last.
-fn best_of(fits: impl IntoIterator<Item = Fit>) -> Option<Fit> {
-    fits.into_iter().max_by(|one, other| one.score.total_cmp(&other.score))
-}
-
 /// Refines the one photo of `model` on the matches that agree with it, twice, so that new inliers join.
 fn refine(
     model: &mut JointModel,
@@ -378,73 +220,6 @@ pub(crate) fn union(first: &[SceneMatch], second: &[SceneMatch]) -> Vec<SceneMat
     all.extend(second.iter().filter(|m| !features.contains(&m.feature) && !points.contains(&m.point)));
     all.sort_unstable();
     all
-}
-
-/// For each camera the pose of greatest truncated score over all matches, best first: from all of them, and where the
-/// intrinsics are known from covisible parts of them, too.
-fn hypotheses(
-    params: &SingleParams,
-    (scene, ground): (&Scene<'_>, &Ground),
-    photo: &QueryPhoto<'_>,
-    cameras: &[Camera],
-    matches: &[SceneMatch],
-    seed: u64,
-) -> Vec<Hypothesis> {
-    let mut subsets = vec![matches.to_vec()];
-    if photo.calibration.is_settled() {
-        subsets.extend(covisible_subsets(scene.index, matches, params.covisible_images));
-    }
-    // Where the ground repeats itself, what agrees best in a part is a pose aside.
-    let standing = subsets
-        .iter()
-        .map(|subset| subset.iter().copied().filter(|m| !ground.holds(m.point)).collect::<Vec<SceneMatch>>());
-    let standing: Vec<_> =
-        standing.zip(&subsets).filter(|(s, all)| s.len() < all.len()).map(|(s, _)| s).collect();
-    subsets.extend(standing);
-    let mut found = Vec::new();
-    for (number, camera) in cameras.iter().enumerate() {
-        let rays = PhotoRays::new(photo.features, camera);
-        let poses = subsets.iter().enumerate().filter_map(|(part, subset)| {
-            let seed = seed.wrapping_add((number * 64 + part) as u64);
-            let pose = estimate(params, scene.index, &rays, subset, seed)?;
-            Some((pose, score(params, (scene.index, ground), &rays, &pose, matches)))
-        });
-        // Of equals the first.
-        let best = poses.reduce(|best, other| if other.1 > best.1 { other } else { best });
-        found.extend(best.map(|(pose, score)| Hypothesis { camera: camera.clone(), pose, score }));
-    }
-    found.sort_by(|one, other| other.score.total_cmp(&one.score));
-    found
-}
-
-/// Pose and focal length in one, from all matches.
-fn by_focal_length(
-    params: &SingleParams,
-    (scene, ground): (&Scene<'_>, &Ground),
-    photo: &QueryPhoto<'_>,
-    matches: &[SceneMatch],
-    seed: u64,
-) -> Option<Hypothesis> {
-    let rays = PhotoRays::new(photo.features, photo.camera);
-    let focal = photo.camera.focal_length();
-    let (mut pixels, mut sigmas, mut points) = (Vec::new(), Vec::new(), Vec::new());
-    for found in matches {
-        let (bearing, sigma) =
-            (rays.rays.bearings[found.feature as usize], rays.rays.sigmas[found.feature as usize]);
-        if bearing.z > 0.0 && sigma.is_finite() {
-            pixels.push(Vector2::new(bearing.x, bearing.y) * (focal / bearing.z));
-            sigmas.push(sigma * focal);
-            points.push(scene.index.position(found.point));
-        }
-    }
-    let range = (FOCAL_RANGE.0 * focal, FOCAL_RANGE.1 * focal);
-    let all = ransac(params);
-    let few = RansacParams { max_iterations: all.max_iterations.min(MAX_FOCAL_SAMPLES), ..all };
-    let found = estimate_absolute_pose_focal(&few, &pixels, &sigmas, &points, range, seed)?;
-    let (camera, pose) = (photo.camera.with_focal_times(found.focal / focal), found.world_from_camera);
-    let rays = PhotoRays::new(photo.features, &camera);
-    let score = score(params, (scene.index, ground), &rays, &pose, matches);
-    Some(Hypothesis { camera, pose, score })
 }
 
 fn ransac(params: &SingleParams) -> RansacParams {
@@ -509,28 +284,10 @@ fn runner_up(
     }
 }
 
-/// Matches to points that the `count` best-supported scene images see, one list an image.
-fn covisible_subsets(index: &SceneIndex, matches: &[SceneMatch], count: usize) -> Vec<Vec<SceneMatch>> {
-    let mut by_image: BTreeMap<ImageId, Vec<SceneMatch>> = BTreeMap::new();
-    for &found in matches {
-        for &row in index.rows_of(found.point) {
-            by_image.entry(index.row(row).image).or_default().push(found);
-        }
-    }
-    let mut subsets: Vec<Vec<SceneMatch>> =
-        by_image.into_values().filter(|subset| subset.len() > SAMPLE).collect();
-    for subset in &mut subsets {
-        subset.dedup();
-    }
-    subsets.sort_by_key(|subset| std::cmp::Reverse(subset.len()));
-    subsets.truncate(count);
-    subsets
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use setloc_features::Calibration;
+    use setloc_features::{Calibration, CameraModel};
 
     use crate::synthetic::{World, along_street};
 
