@@ -28,6 +28,8 @@ pub struct QualityParams {
     pub min_expected_share: f64,
     /// Fewest points of a well supported image.
     pub min_image_points: usize,
+    /// Whether images of scenes are left out that fewer points hold than that, where far more matches contradict their place.
+    pub leave_out_misplaced: bool,
 }
 
 impl Default for QualityParams {
@@ -38,6 +40,7 @@ impl Default for QualityParams {
             min_expected_points: 150,
             min_expected_share: 0.8,
             min_image_points: 50,
+            leave_out_misplaced: true,
         }
     }
 }
@@ -458,6 +461,28 @@ const LOUD_SHARE: f64 = 0.2;
 const MOST_NAMED: usize = 5;
 
 impl QualityReport {
+    /// Images with few points on one side of a link that a pair within the component outweighs by far, ascending: where they are
+    /// rests on wrong matches. Each with that pair; those that baselines are measured from or to are held by these.
+    pub fn misplaced(&self, component: &Reconstruction) -> BTreeMap<ImageId, &OutvotedPair> {
+        let weak: BTreeSet<ImageId> = self.weak_images.iter().map(|(image, _)| *image).collect();
+        let is_within = |pair: &&OutvotedPair| {
+            component.images[pair.second.index()].world_from_camera.is_some() && pair.weight() >= FOLD_WEIGHT
+        };
+        let mut misplaced = BTreeMap::new();
+        for pair in self.outvoted.iter().filter(is_within) {
+            let (one, other): (Vec<ImageId>, Vec<ImageId>) =
+                component.registered().partition(|image| pair.side.binary_search(image).is_ok());
+            let fewer = if one.len() <= other.len() { one } else { other };
+            let is_held = |image: &ImageId| component.lengths.iter().any(|length| length.involves(*image));
+            if fewer.iter().all(|image| weak.contains(image) && !is_held(image)) {
+                for image in fewer {
+                    misplaced.entry(image).or_insert(pair);
+                }
+            }
+        }
+        misplaced
+    }
+
     /// The report in sentences, worst first; empty when nothing disagrees.
     pub fn sentences(&self, reconstruction: &Reconstruction) -> Vec<String> {
         let name = |image: ImageId| reconstruction.images[image.index()].name.as_str();
@@ -729,6 +754,27 @@ mod tests {
         assert_eq!(doubtful_images(&model, &[], &[together(true)]), [0, 1, 2, 5, 6].map(ImageId));
         // Trees may stand between two that no match speaks against.
         assert_eq!(doubtful_images(&model, &[], &[together(false)]), []);
+    }
+
+    #[test]
+    fn weak_images_that_far_more_matches_contradict_are_misplaced() {
+        let images = (0..5).map(|at| image("", f64::from(at))).collect();
+        let model = Reconstruction { images, ..Reconstruction::default() };
+        let misplaced = |matches: usize, side: &[u32], weak: &[u32]| -> Vec<u32> {
+            let side = side.iter().map(|image| ImageId(*image)).collect();
+            let outvoted =
+                vec![OutvotedPair { first: ImageId(0), second: ImageId(3), matches, held_by: 20, side }];
+            let weak_images = weak.iter().map(|image| (ImageId(*image), 30)).collect();
+            let report = QualityReport { outvoted, weak_images, ..QualityReport::default() };
+            report.misplaced(&model).into_keys().map(|image| image.0).collect()
+        };
+        assert_eq!(misplaced(57, &[0], &[0]), [0]);
+        assert_eq!(misplaced(57, &[0, 1], &[0, 1, 3]), [0, 1]);
+        // The other side is the smaller one.
+        assert_eq!(misplaced(57, &[0, 1, 2, 4], &[3]), [3]);
+        // What is well held stays, and what hardly more speaks against.
+        assert_eq!(misplaced(57, &[0, 1], &[0]), [0; 0]);
+        assert_eq!(misplaced(29, &[0], &[0]), [0; 0]);
     }
 
     #[test]

@@ -245,6 +245,17 @@ impl Reconstruction {
             .filter(|id| self.images[id.index()].world_from_camera.is_some())
     }
 
+    /// Takes the poses of images and what they see.
+    pub fn leave_out(&mut self, images: &[ImageId]) {
+        for image in images {
+            self.images[image.index()].world_from_camera = None;
+            for point in &mut self.points {
+                point.track.retain(|seen| seen.image != *image);
+            }
+        }
+        self.points.retain(|point| point.track.len() >= 2);
+    }
+
     /// The same with images in the order of their names, as people list them.
     pub fn by_name(&self) -> Self {
         let mut order: Vec<usize> = (0..self.images.len()).collect();

@@ -8,8 +8,8 @@ use serde_json::json;
 use setloc_features::{Calibration, Camera, ImageFeatures, Match};
 use setloc_sfm::{
     CameraId, Georegistration, ImageId, InputImage, MOST_NAMED, MapperInput, MapperOutput, MapperParams,
-    MeasuredPosition, PairGeometry, PutativePair, QualityParams, Reconstruction, TwoViewParams, assess,
-    listed, reconstruct,
+    MeasuredPosition, PairGeometry, PutativePair, QualityParams, QualityReport, Reconstruction,
+    TwoViewParams, assess, listed, reconstruct,
 };
 
 use super::alignment::{KnownOfModel, add_alignment};
@@ -100,15 +100,19 @@ pub fn add_model(
         calibrate_photos: config.sfm.calibrate_photos && kind == ModelKind::Scene,
         ..config.sfm.clone()
     };
+    let quality = QualityParams {
+        leave_out_misplaced: config.quality.leave_out_misplaced && kind == ModelKind::Scene,
+        ..config.quality.clone()
+    };
     let params = json!({
-        "sfm": mapper, "two_view": config.two_view, "quality": config.quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "calibrations": cameras.calibrations,
+        "sfm": mapper, "two_view": config.two_view, "quality": quality, "georegistration": config.georegistration, "seed": seed, "images": placed, "cameras": cameras.cameras, "calibrations": cameras.calibrations,
     });
     // A plain panorama has nothing to adjust unless the mapper finds it stretched.
     let is_fixed = |(calibration, camera): (&Calibration, &Camera)| {
         calibration.is_settled() && camera.as_stitched().is_none()
     };
     let fixed = cameras.calibrations.iter().zip(&cameras.cameras).map(is_fixed).collect();
-    let stage = ModelConfig { mapper, two_view: config.two_view.clone(), quality: config.quality.clone() };
+    let stage = ModelConfig { mapper, two_view: config.two_view.clone(), quality };
     let measured =
         Measurements { params: config.georegistration.clone(), positions: positions.to_vec(), seed };
     let of_model = measured.clone();
@@ -277,10 +281,20 @@ fn run_model(
     let contents: Vec<ContentHash> =
         features.iter().map(|(at, _)| inputs.hash(&features_role(*at))).collect::<Result<_>>()?;
     pairs.retain(|pair| contents[pair.first.index()] != contents[pair.second.index()]);
-    for at in 0..output.components.len() {
-        let (larger, rest) = output.components.split_at_mut(at);
-        let component = &mut rest[0];
-        let report = assess(quality, component, larger, &pairs);
+    let assessed = |components: &[Reconstruction]| -> Vec<QualityReport> {
+        let report = |at: usize| assess(quality, &components[at], &components[..at], &pairs);
+        (0..components.len()).map(report).collect()
+    };
+    let mut reports = assessed(&output.components);
+    if quality.leave_out_misplaced {
+        let left_out = leave_out_misplaced(&mut output.components, &reports);
+        if !left_out.is_empty() {
+            reports = assessed(&output.components);
+        }
+        output.report.warnings.extend(left_out);
+    }
+    for (at, report) in reports.into_iter().enumerate() {
+        let component = &mut output.components[at];
         output.report.warnings.extend(report.sentences(component));
         output.outvoted.push(report.outvoted);
         output.suspicious.push(report.suspicious);
@@ -288,6 +302,31 @@ fn run_model(
         output.report.warnings.extend(apart(at, component, &output.report.georegistrations));
     }
     Product::new(output)
+}
+
+/// Takes out of each component what its report says is misplaced, and says so.
+fn leave_out_misplaced(components: &mut Vec<Reconstruction>, reports: &[QualityReport]) -> Vec<String> {
+    let mut said = Vec::new();
+    for (component, report) in components.iter_mut().zip(reports) {
+        let misplaced = report.misplaced(component);
+        let name = |image: ImageId| component.images[image.index()].name.as_str();
+        said.extend(misplaced.iter().map(|(image, pair)| {
+            format!(
+                "{} is left out: the {} matches of {} and {} contradict its place, which {} points hold",
+                name(*image),
+                pair.matches,
+                name(pair.first),
+                name(pair.second),
+                pair.held_by
+            )
+        }));
+        let images: Vec<ImageId> = misplaced.into_keys().collect();
+        component.leave_out(&images);
+    }
+    let size = |component: &Reconstruction| component.registered().count();
+    components.retain(|component| size(component) >= 2);
+    components.sort_by_key(|component| std::cmp::Reverse(size(component)));
+    said
 }
 
 /// Says of another component than the largest that it is none with it, and in which frame photos are localized there.

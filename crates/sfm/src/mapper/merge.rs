@@ -225,8 +225,8 @@ impl Parts<'_> {
                     let mut apart = self.all[moved].clone();
                     let others: Vec<ImageId> =
                         apart.component.registered().filter(|image| !strangers.contains(image)).collect();
-                    apart.leave_out(&others);
-                    self.all[moved].leave_out(&strangers);
+                    apart.component.leave_out(&others);
+                    self.all[moved].component.leave_out(&strangers);
                     self.all.push(apart);
                     self.all.retain(|part| part.size() >= 2);
                 }

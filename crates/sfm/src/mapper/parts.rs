@@ -45,19 +45,8 @@ impl Part {
                 || self.component.lengths.iter().any(|length| length.involves(image))
         };
         let unheld: Vec<ImageId> = self.component.registered().filter(|image| !held(*image)).collect();
-        self.leave_out(&unheld);
+        self.component.leave_out(&unheld);
         (self.component, unheld)
-    }
-
-    /// Takes the poses of images and what they see.
-    pub fn leave_out(&mut self, images: &[ImageId]) {
-        for image in images {
-            self.component.images[image.index()].world_from_camera = None;
-            for point in &mut self.component.points {
-                point.track.retain(|seen| seen.image != *image);
-            }
-        }
-        self.component.points.retain(|point| point.track.len() >= 2);
     }
 
     /// The part with further observations of its points, where images have few.
@@ -175,7 +164,7 @@ impl<'a> Parts<'a> {
                 self.all[at] = mapper.into_part();
                 let admitted: Vec<ImageId> = self.all[at].component.registered().collect();
                 for (_, other) in self.all.iter_mut().enumerate().filter(|(other, _)| *other != at) {
-                    other.leave_out(&admitted);
+                    other.component.leave_out(&admitted);
                 }
                 self.all.retain(|part| part.size() >= 2);
             }
