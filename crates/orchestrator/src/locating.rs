@@ -90,7 +90,8 @@ pub fn best_answers<'a>(
 
 /// Locates photos; `target` is the photo that decides in [`Mode::Auto`].
 ///
-/// Photos of a camera whose told intrinsics the scene's own photos contradict have those that these show.
+/// Photos of a camera whose told intrinsics the scene's own photos contradict have those that these show, which the last of the
+/// warnings of `folder` says then.
 ///
 /// Where intrinsics of a set are a guess, the set is located twice: the second time with the cameras that the scene told the
 /// first time, which `folder` has afterwards. Before that, photos taken on one spot tell theirs, and guesses that do not hold are
@@ -107,11 +108,11 @@ pub fn locate(
     name: &str,
     target: &str,
 ) -> Result<Located> {
-    let (skipped, mut warnings) = (folder.skipped.clone(), folder.warnings.clone());
     if what.config.sfm.calibrate_photos {
         let corrected = correct_told(&mut folder.images, &what.scene.corrected);
-        warnings.extend(said_of_corrected(&corrected));
+        folder.warnings.extend(said_of_corrected(&corrected));
     }
+    let (skipped, warnings) = (folder.skipped.clone(), folder.warnings.clone());
     let mut located = Located { skipped, warnings, ..Located::default() };
     let mut whole = RunResult::default();
     if matches!(mode, Mode::Auto | Mode::Single) {

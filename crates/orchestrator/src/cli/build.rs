@@ -248,7 +248,7 @@ fn add_warnings(folder: &mut ImageFolder, warnings: Vec<String>) {
     folder.warnings.extend(warnings);
 }
 
-fn warn(warnings: &[String]) {
+pub(super) fn warn(warnings: &[String]) {
     for warning in warnings {
         print::note(&format!("warning: {warning}"));
     }

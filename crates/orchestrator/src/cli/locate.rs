@@ -11,7 +11,7 @@ use setloc_sfm::{CameraId, MOST_NAMED, Reconstruction, ReconstructionImage, list
 use super::Answer;
 use super::args::LocateArgs;
 use super::build::{
-    export_folder, remark, scene_markers, warn_skipped, write_json, write_models, write_report,
+    export_folder, remark, scene_markers, warn, warn_skipped, write_json, write_models, write_report,
 };
 use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input, refuse_same_folder};
 use crate::dataset::{
@@ -64,8 +64,9 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
         Mode::Auto if args.grow.is_some() => Mode::Both,
         mode => mode,
     };
-    let given = photos.images.clone();
+    let (given, said) = (photos.images.clone(), photos.warnings.len());
     let located = locate(&session, &mut photos, &what, mode, &name, &target)?;
+    warn(&photos.warnings[said..]);
     let told = ImageFolder { images: with_told_alone(&given, &photos.images, &located), ..photos.clone() };
     told.estimated_cameras().iter().for_each(|line| print::note(line));
     write_results(&args.output, &located, &what.scene, &target, &session)?;
