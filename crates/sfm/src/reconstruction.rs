@@ -1,3 +1,5 @@
+use std::cmp::Reverse;
+
 use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 use setloc_features::{Camera, Keypoint};
@@ -243,6 +245,13 @@ impl Reconstruction {
         (0..self.images.len() as u32)
             .map(ImageId)
             .filter(|id| self.images[id.index()].world_from_camera.is_some())
+    }
+
+    /// Leaves components of at least two images, the largest first and of equals in the order that they have.
+    pub fn largest_first(components: &mut Vec<Self>) {
+        let size = |component: &Self| component.registered().count();
+        components.retain(|component| size(component) >= 2);
+        components.sort_by_key(|component| Reverse(size(component)));
     }
 
     /// Takes the poses of images and what they see.

@@ -323,9 +323,7 @@ fn leave_out_misplaced(components: &mut Vec<Reconstruction>, reports: &[QualityR
         let images: Vec<ImageId> = misplaced.into_keys().collect();
         component.leave_out(&images);
     }
-    let size = |component: &Reconstruction| component.registered().count();
-    components.retain(|component| size(component) >= 2);
-    components.sort_by_key(|component| std::cmp::Reverse(size(component)));
+    Reconstruction::largest_first(components);
     said
 }
 

@@ -64,7 +64,8 @@ pub struct MapperParams {
     /// the model clearly better. It applies to local models of photo sets only.
     pub correct_told: bool,
     /// Whether photos are asked for the intrinsics that they are told, and have other focal lengths and distortion where these
-    /// explain the model clearly better. It applies to scenes, and with them to photos of the same cameras that are localized there; where it is on, [`Self::correct_told`] is not asked.
+    /// explain the model clearly better. It applies to scenes, and with them to photos of the same cameras that are localized
+    /// there; where it is on, [`Self::correct_told`] is not asked.
     pub calibrate_photos: bool,
     /// Whether panoramas are asked how their stitching stretches directions ([`CameraModel::StitchedEquirectangular`]), and
     /// have that taken out where it explains the model clearly better.

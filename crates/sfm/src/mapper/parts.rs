@@ -216,9 +216,7 @@ impl<'a> Parts<'a> {
             components.push(component);
         }
         // Images that were left out may change which is the largest.
-        let size = |component: &Reconstruction| component.registered().count();
-        components.retain(|component| size(component) >= 2);
-        components.sort_by_key(|component| Reverse(size(component)));
+        Reconstruction::largest_first(&mut components);
         MapperOutput { components, report, ..MapperOutput::default() }
     }
 }
