@@ -77,7 +77,7 @@ use self::{
 use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind, bundle::BundleParams};
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 64;
+pub const MAPPER_VERSION: u32 = 65;
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///
@@ -604,7 +604,7 @@ impl<'a> Mapper<'a> {
                     && !self.params.is_recognized(&seen)
                     && !self.shares_as_neighbour(image, &pose)
                     && !self.is_latecomer(image, &pose)
-                    && !self.hangs(image, &pose)
+                    && !self.is_held_by_pairs(image, &pose)
             }
         };
         is_misplaced.then_some(seen)

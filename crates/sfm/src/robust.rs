@@ -8,6 +8,7 @@ pub(crate) mod absolute_pose;
 mod absolute_pose_focal;
 mod generalized_pose;
 pub(crate) mod least_squares;
+mod pose_from_views;
 mod ransac;
 mod ray_homography;
 mod relative_pose;
@@ -20,6 +21,7 @@ pub use generalized_pose::{
     GeneralizedPoseEstimate, GeneralizedPoseOptions, GeneralizedSolver, Gravity, SetScale,
     estimate_generalized_pose, refine_generalized_pose,
 };
+pub(crate) use pose_from_views::{KnownView, refine_pose_from_views};
 pub use ransac::{InvalidParams, RansacParams};
 pub use ray_homography::{RayHomographyEstimate, estimate_ray_homography};
 pub use relative_pose::{

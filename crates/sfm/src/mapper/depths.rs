@@ -270,14 +270,41 @@ pub(super) fn step(
     to_from_from: &Rigid,
     matches: &[Match],
 ) -> Option<(Rigid, BaselineLength)> {
-    let reference = reference_of(model, from)?;
-    let center = |image: ImageId| model.poses[image.index()].as_ref().map(|pose| *pose.center());
-    let baseline = (center(from)? - center(reference)?).norm();
     let rays = [&model.rays[from.index()], rays_of_to];
     let known = of_points(model, from);
     let own = floor(&known);
     let floor = own.filter(|floor| floor.points >= MANY_FLOOR_POINTS).or(of_all).or(own);
     let found = length(&known, floor, &of_pair(rays, to_from_from, matches))?;
+    step_of(model, [from, to], to_from_from, found)
+}
+
+/// The same step in a model where nothing beside tells its length, by a model that knows it and by the floor, above which the
+/// images of both stand alike: `floors` are those of this model and of that one.
+pub(super) fn step_by_floors(
+    model: &Model<'_>,
+    floors: [Floor; 2],
+    images: [ImageId; 2],
+    to_from_from: &Rigid,
+    (known, known_length): &(Rigid, BaselineLength),
+) -> Option<(Rigid, BaselineLength)> {
+    let [floor, known_floor] = floors;
+    let found = Found {
+        length: known.translation.norm() * (floor.drop - known_floor.drop).exp(),
+        deviation: known_length.deviation.hypot(floor.sigma).hypot(known_floor.sigma),
+        votes: known_length.votes,
+    };
+    step_of(model, images, to_from_from, found)
+}
+
+fn step_of(
+    model: &Model<'_>,
+    [from, to]: [ImageId; 2],
+    to_from_from: &Rigid,
+    found: Found,
+) -> Option<(Rigid, BaselineLength)> {
+    let reference = reference_of(model, from)?;
+    let center = |image: ImageId| model.poses[image.index()].as_ref().map(|pose| *pose.center());
+    let baseline = (center(from)? - center(reference)?).norm();
     let from_from_to = to_from_from.inverse();
     let along = from_from_to.translation.try_normalize(0.0)? * found.length;
     let step = StepPose {
@@ -292,6 +319,7 @@ pub(super) fn step(
 mod tests {
     use rand::Rng;
 
+    use super::super::test_street::{POINTS, Street, first_two};
     use super::*;
     use crate::synthetic::{normal, seeded};
 
@@ -348,6 +376,27 @@ mod tests {
         }
         assert!(length(&[], None, &room("pair", 60, 1.0, |_| true)).is_none());
         assert!(floor(&[]).is_none());
+    }
+
+    #[test]
+    fn a_length_is_carried_from_a_model_to_another_by_the_floor_below_both() {
+        let street = Street::new("floors", 60, POINTS);
+        let input = street.input();
+        let model = first_two(&street, &input);
+        let to_from_from = street.poses[2].inverse() * street.poses[1];
+        let truth = to_from_from.inverse();
+        let floor = |drop: f64| Floor { drop: drop.ln(), sigma: 0.03, points: 0.0 };
+        // The other model is 2.5 times as large, and knows the step the other way round.
+        let images = [ImageId(1), ImageId(2)];
+        let length = Found { length: 2.5 * truth.translation.norm(), deviation: 0.02, votes: 12 };
+        let known = step_of(&model, images, &to_from_from, length).expect("the two share points");
+        let found = step_by_floors(&model, [floor(1.4), floor(3.5)], images, &to_from_from, &known);
+        let (step, length) = found.expect("the two share points");
+        assert!((step.translation - truth.translation).norm() < 1e-9, "{step:?} {truth:?}");
+        assert!(step.rotation.angle_to(&truth.rotation) < 1e-9);
+        let deviation = (0.02_f64.powi(2) + 2.0 * 0.03_f64.powi(2)).sqrt();
+        assert!((length.deviation - deviation).abs() < 1e-9 && length.votes == 12, "{length:?}");
+        assert_eq!([length.reference, length.from, length.to], [0, 1, 2].map(ImageId));
     }
 
     #[test]

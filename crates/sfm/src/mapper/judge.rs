@@ -128,24 +128,25 @@ impl Mapper<'_> {
 
     /// Whether an image may hang at a pose by one pair whose length depths tell.
     fn may_hang(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        let sigmas = self.params.max_error_sigma;
+        let support = self.support(image, world_from_camera);
+        self.is_held_by_pairs(image, world_from_camera)
+            && (support.is_strong()
+                || self.shares_with_one(image, world_from_camera)
+                || stands_on_floor(&self.model, image, world_from_camera, sigmas))
+    }
+
+    /// Whether a registered image is held by pairs such as are right in this model, whatever walls hide from it.
+    ///
+    /// Less is asked than of one that comes in by a pair ([`Self::may_hang`]): when two parts become one that a door joins, each
+    /// image ought to see by all that is in plain view what stands in the other's rooms.
+    pub(super) fn is_held_by_pairs(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
         if !self.admits_by_depths {
             return false;
         }
-        let sigmas = self.params.max_error_sigma;
         let support = self.support(image, world_from_camera);
-        let is_at_home = || {
-            support.is_strong()
-                || self.shares_with_one(image, world_from_camera)
-                || stands_on_floor(&self.model, image, world_from_camera, sigmas)
-        };
         support.is_enough_if_right()
-            && Worth::of(&[&self.model], sigmas).believes(support.widest)
-            && is_at_home()
-    }
-
-    /// Whether a registered image hangs so.
-    pub(super) fn hangs(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
-        self.model.lengths.iter().any(|length| length.to == image) && self.may_hang(image, world_from_camera)
+            && Worth::of(&[&self.model], self.params.max_error_sigma).believes(support.widest)
     }
 
     fn shares_with_one(&self, image: ImageId, world_from_camera: &Rigid) -> bool {

@@ -15,11 +15,18 @@ use std::{cmp::Reverse, f64::consts::PI};
 use nalgebra::Vector3;
 
 use super::{
-    MapperInput, Part, correspondence::CorrespondenceGraph, depths, model::Model, register::PoseHypothesis,
-    support::Support,
+    MapperInput, Part,
+    correspondence::CorrespondenceGraph,
+    depths,
+    model::Model,
+    register::PoseHypothesis,
+    support::{MIN_FOR, Support},
+    witnesses::count_agreeing,
 };
 use crate::{
-    BaselineLength, ImageId, PairGeometry, Rigid, TwoViewKind, solvers::triangulation::length_along,
+    BaselineLength, ImageId, PairGeometry, Rigid, TwoViewKind,
+    robust::{KnownView, RansacParams, refine_pose_from_views},
+    solvers::triangulation::length_along,
 };
 
 /// Largest part whose images are asked whether they belong to a larger one.
@@ -31,6 +38,8 @@ const ELSEWHERE_LEAD: usize = 2;
 const CROSSED_PAIRS: usize = 12;
 /// Largest difference between the rotations that two pairs give, and between a direction and the place that two cross in.
 const SAME_DIRECTION_RAD: f64 = 0.03;
+/// How many times farther off than those of a pair that is for a pose the matches of one may be that is nearly for it.
+const NEARLY: f64 = 4.0;
 /// Smallest angle between two directions that a place is told by.
 const MIN_CROSSING_RAD: f64 = 0.1;
 
@@ -67,7 +76,9 @@ struct Edge {
 
 /// The pose where the directions of two verified pairs cross for which most matches of all pairs are.
 ///
-/// Rotation and direction are those of one pair, so that its matches meet; the other gives the length.
+/// Rotation and direction are those of one pair, so that its matches meet; the other gives the length. Of few matches both are a
+/// degree or two off, by which a third pair of the same place would count as against it: so the pose is the one that all pairs
+/// agree on which are nearly for it, if more of them are for that.
 pub(super) fn hypothesize_from_crossings(
     model: &Model<'_>,
     graph: &CorrespondenceGraph,
@@ -107,7 +118,34 @@ pub(super) fn best_crossing(
             }
         }
     }
-    best.map(|(_, pose)| pose)
+    let (matches, pose) = best?;
+    let agreed = agreed_by_pairs(model, image, &pose, max_error_sigma);
+    let is_better = Support::of(model, taken, image, &agreed, max_error_sigma).matches > matches;
+    Some(if is_better { agreed } else { pose })
+}
+
+/// The pose that those pairs agree on that are nearly for a pose.
+fn agreed_by_pairs(model: &Model<'_>, image: ImageId, pose: &Rigid, max_error_sigma: f64) -> Rigid {
+    let view = |pair: &PairGeometry| {
+        let (other, _) = pair.seen_from(image)?;
+        let world_from_camera = model.poses[other.index()].as_ref()?.world_from_camera;
+        let image_from_other = pose.inverse() * world_from_camera;
+        let near = count_agreeing(model, pair, image, &image_from_other, NEARLY * max_error_sigma);
+        let is_near = near as f64 >= MIN_FOR * pair.two_view.inliers.len() as f64;
+        is_near.then(|| {
+            let matches = pair.matches_from(other);
+            let (known, sought) = (&model.rays[other.index()], &model.rays[image.index()]);
+            KnownView {
+                world_from_camera,
+                bearings: matches.iter().map(|m| known.bearings[m.first as usize]).collect(),
+                sigmas: matches.iter().map(|m| known.sigmas[m.first as usize]).collect(),
+                sought_bearings: matches.iter().map(|m| sought.bearings[m.second as usize]).collect(),
+                sought_sigmas: matches.iter().map(|m| sought.sigmas[m.second as usize]).collect(),
+            }
+        })
+    };
+    let views: Vec<KnownView> = pairs_with(model, image).into_iter().filter_map(view).collect();
+    refine_pose_from_views(&RansacParams { max_error_sigma, ..RansacParams::default() }, &views, pose)
 }
 
 /// The pose by one verified pair whose length depths tell ([`depths`]) that most speaks for.

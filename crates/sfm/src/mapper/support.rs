@@ -12,7 +12,7 @@ use super::{model::Model, witnesses::count_agreeing};
 use crate::{ImageId, PairGeometry, Rigid, direction};
 
 /// Share of a pair's verified matches on the epipolar circles of a pose from which the pair is for that pose.
-const MIN_FOR: f64 = 0.8;
+pub(super) const MIN_FOR: f64 = 0.8;
 /// Pairs that have to be for a pose.
 const MIN_PAIRS_FOR: usize = 2;
 /// How many times more matches the pairs for a pose must have than the strongest pair against it, and how many times fewer they

@@ -176,9 +176,10 @@ const LEAST_VARIANCE: f64 = 0.01;
 const PARALLEL_SIGMA: f64 = 3.0;
 
 #[derive(Debug, Clone, Copy)]
-struct SecondFromFirst {
-    rotation: Matrix3<f64>,
-    translation: Vector3<f64>,
+pub(super) struct SecondFromFirst {
+    pub rotation: Matrix3<f64>,
+    /// Of unit length.
+    pub translation: Vector3<f64>,
 }
 
 impl From<Consented<SecondFromFirst>> for RelativePoseEstimate {
@@ -192,15 +193,15 @@ impl From<Consented<SecondFromFirst>> for RelativePoseEstimate {
     }
 }
 
-struct RelativeMatches<'a> {
-    first: &'a [Vector3<f64>],
-    second: &'a [Vector3<f64>],
-    variances: Vec<(f64, f64)>,
-    inverse_scale_squared: f64,
+pub(super) struct RelativeMatches<'a> {
+    pub first: &'a [Vector3<f64>],
+    pub second: &'a [Vector3<f64>],
+    pub variances: Vec<(f64, f64)>,
+    pub inverse_scale_squared: f64,
 }
 
 impl<'a> RelativeMatches<'a> {
-    fn new(
+    pub fn new(
         params: &RansacParams,
         first: &'a [Vector3<f64>],
         second: &'a [Vector3<f64>],
@@ -224,7 +225,7 @@ impl<'a> RelativeMatches<'a> {
     /// e = x₂·(t × y) with y = R·x₁; its variance v = σ₁²·‖B₁ᵀEᵀx₂‖² + σ₂²·‖B₂ᵀEx₁‖² simplifies for unit vectors to
     /// σ₁²·(1 − (x₂·t)² − e²) + σ₂²·(1 − (t·y)² − e²).
     #[inline(always)]
-    fn sampson(&self, model: &SecondFromFirst, index: usize) -> Sampson {
+    pub fn sampson(&self, model: &SecondFromFirst, index: usize) -> Sampson {
         let (variance_first, variance_second) = self.variances[index];
         let rotated = model.rotation * self.first[index];
         let second = self.second[index];
@@ -263,10 +264,10 @@ impl<'a> RelativeMatches<'a> {
     }
 }
 
-struct Sampson {
+pub(super) struct Sampson {
     rotated: Vector3<f64>,
-    error: f64,
-    variance: f64,
+    pub error: f64,
+    pub variance: f64,
     along_second: f64,
     along_first: f64,
 }
@@ -316,7 +317,7 @@ impl LeastSquares<5> for RelativeFit<'_> {
 
 /// ∂(e/√v) over δω and δt, 1×3 each: R ← exp(δω)·R, t ← t + δt.
 #[inline(always)]
-fn sampson_derivative(
+pub(super) fn sampson_derivative(
     term: &Sampson,
     second: &Vector3<f64>,
     translation: &Vector3<f64>,

@@ -134,8 +134,17 @@ impl<'a> Attempt<'_, '_, 'a> {
             let rays = &to_side.rays[to.index()];
             depths::step(model, floor, [from, to], rays, &to_from_from, &pair.matches_from(from))
         };
-        let (kept_step, kept_length) = step(kept, kept_floor, of_kept, of_moved, moved)?;
-        let (moved_step, moved_length) = step(moved, moved_floor, of_moved, of_kept, kept)?;
+        let by_floors = |model: &Model<'_>, floors: [Option<Floor>; 2], from: ImageId, to: ImageId, known| {
+            let [Some(floor), Some(known_floor)] = floors else { return None };
+            let (_, to_from_from) = pair.seen_from(to)?;
+            depths::step_by_floors(model, [floor, known_floor], [from, to], &to_from_from, known)
+        };
+        let by_kept = step(kept, kept_floor, of_kept, of_moved, moved);
+        let by_moved = step(moved, moved_floor, of_moved, of_kept, kept);
+        let (kept_step, kept_length) = by_kept
+            .or_else(|| by_floors(kept, [kept_floor, moved_floor], of_kept, of_moved, by_moved.as_ref()?))?;
+        let (moved_step, moved_length) = by_moved
+            .or_else(|| by_floors(moved, [moved_floor, kept_floor], of_moved, of_kept, by_kept.as_ref()?))?;
         let pose = |model: &Model<'_>, image: ImageId| Some(model.poses[image.index()]?.world_from_camera);
         let in_kept = pose(kept, of_kept)? * kept_step;
         let in_moved = pose(moved, of_moved)?;
