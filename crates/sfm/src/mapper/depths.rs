@@ -386,7 +386,7 @@ mod tests {
         let to_from_from = street.poses[2].inverse() * street.poses[1];
         let truth = to_from_from.inverse();
         let floor = |drop: f64| Floor { drop: drop.ln(), sigma: 0.03, points: 0.0 };
-        // The other model is 2.5 times as large, and knows the step the other way round.
+        // The other model's unit is 2.5 times as small.
         let images = [ImageId(1), ImageId(2)];
         let length = Found { length: 2.5 * truth.translation.norm(), deviation: 0.02, votes: 12 };
         let known = step_of(&model, images, &to_from_from, length).expect("the two share points");

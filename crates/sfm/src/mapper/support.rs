@@ -46,10 +46,10 @@ pub(super) struct Support {
     pub widest: usize,
     /// The same of the most spread pair that is against it, with an image of the model or of another large part.
     pub spread_against: usize,
-    /// In how many directions the image shows what the pairs for it share with it ([`direction::spread`]); `None` of several images.
-    pub directions: Option<usize>,
     /// The same of the most spread pair with an image that waits.
     pub spread_waiting: usize,
+    /// How spread, in the image itself, the matches of all pairs for it are, each direction counted once; `None` of several images.
+    pub directions: Option<usize>,
 }
 
 impl Support {
@@ -308,7 +308,7 @@ fn spread(model: &Model<'_>, pair: &PairGeometry) -> usize {
     spreads.into_iter().flatten().min().unwrap_or(0)
 }
 
-/// In how many directions an image shows what the pairs share with it that are for a pose of it.
+/// How spread the matches of all pairs are that are for a pose of an image, together and in that image.
 fn directions(model: &Model<'_>, image: ImageId, world_from_camera: &Rigid, max_error_sigma: f64) -> usize {
     let bearings = &model.rays[image.index()].bearings;
     let shared = model.input.pairs.iter().filter_map(|pair| {
