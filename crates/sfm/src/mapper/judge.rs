@@ -129,11 +129,11 @@ impl Mapper<'_> {
     /// Whether an image may hang at a pose by one pair whose length depths tell.
     fn may_hang(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
         let sigmas = self.params.max_error_sigma;
-        let support = self.support(image, world_from_camera);
-        self.is_held_by_pairs(image, world_from_camera)
-            && (support.is_strong()
+        self.right_support(image, world_from_camera).is_some_and(|support| {
+            support.is_strong()
                 || self.shares_with_one(image, world_from_camera)
-                || stands_on_floor(&self.model, image, world_from_camera, sigmas))
+                || stands_on_floor(&self.model, image, world_from_camera, sigmas)
+        })
     }
 
     /// Whether a registered image is held by pairs such as are right in this model, whatever walls hide from it.
@@ -141,12 +141,18 @@ impl Mapper<'_> {
     /// Less is asked than of one that comes in by a pair ([`Self::may_hang`]): when two parts become one that a door joins, each
     /// image ought to see by all that is in plain view what stands in the other's rooms.
     pub(super) fn is_held_by_pairs(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        self.right_support(image, world_from_camera).is_some()
+    }
+
+    /// What the pairs say for a pose where images may come in by depths, if it is enough and such pairs are right in this model.
+    fn right_support(&self, image: ImageId, world_from_camera: &Rigid) -> Option<Support> {
         if !self.admits_by_depths {
-            return false;
+            return None;
         }
         let support = self.support(image, world_from_camera);
-        support.is_enough_if_right()
-            && Worth::of(&[&self.model], self.params.max_error_sigma).believes(support.widest)
+        let is_right = support.is_enough_if_right()
+            && Worth::of(&[&self.model], self.params.max_error_sigma).believes(support.widest);
+        is_right.then_some(support)
     }
 
     fn shares_with_one(&self, image: ImageId, world_from_camera: &Rigid) -> bool {

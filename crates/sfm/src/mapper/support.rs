@@ -114,13 +114,10 @@ impl Support {
                 Some(model.poses[of.index()]?.world_from_camera)
             }
         };
-        let mut support = Self {
-            directions: Some(directions(model, image, world_from_camera, max_error_sigma)),
-            ..Self::default()
-        };
-        for ([first, second], said) in
-            ask(model, |pair| pair.seen_from(image).is_some(), pose, max_error_sigma)
-        {
+        let asked = ask(model, |pair| pair.seen_from(image).is_some(), pose, max_error_sigma);
+        let mut support =
+            Self { directions: Some(directions(model, image, asked.values())), ..Self::default() };
+        for ([first, second], said) in asked {
             let partner = if first == image { second } else { first };
             if said.agreeing.matches > 0 {
                 support.add(said.agreeing);
@@ -160,7 +157,7 @@ impl Support {
         Self::of_said(ask(model, is_asked, pose, max_error_sigma).values())
     }
 
-    fn of_said<'s>(all: impl Iterator<Item = &'s PairSays>) -> Self {
+    fn of_said<'s>(all: impl Iterator<Item = &'s PairSays<'s>>) -> Self {
         let mut support = Self::default();
         for said in all {
             if said.agreeing.matches > 0 {
@@ -212,12 +209,10 @@ pub(super) fn most_contradicted(
     let mut most: Option<(f64, Vec<ImageId>)> = None;
     for group in groups.into_iter().filter(|group| group.iter().all(|&image| may_leave(image))) {
         let crosses = |images: &&[ImageId; 2]| group.contains(&images[0]) != group.contains(&images[1]);
-        let across = said.iter().filter(|(images, _)| crosses(images)).map(|(_, said)| said);
-        let mut support = Support::of_said(across);
-        if let [image] = group[..]
-            && let Some(world_from_camera) = pose(image)
-        {
-            support.directions = Some(directions(model, image, &world_from_camera, max_error_sigma));
+        let across = || said.iter().filter(|(images, _)| crosses(images)).map(|(_, said)| said);
+        let mut support = Support::of_said(across());
+        if let [image] = group[..] {
+            support.directions = Some(directions(model, image, across()));
         }
         if (LEAD * support.against) as f64 > support.matches as f64 && !support.is_untenable() {
             let other_places = group.iter().filter_map(|&image| {
@@ -308,18 +303,12 @@ fn spread(model: &Model<'_>, pair: &PairGeometry) -> usize {
     spreads.into_iter().flatten().min().unwrap_or(0)
 }
 
-/// How spread the matches of all pairs are that are for a pose of an image, together and in that image.
-fn directions(model: &Model<'_>, image: ImageId, world_from_camera: &Rigid, max_error_sigma: f64) -> usize {
+/// How spread the matches of all agreeing pairs of an image are, together and in that image.
+fn directions<'s>(model: &Model<'_>, image: ImageId, said: impl Iterator<Item = &'s PairSays<'s>>) -> usize {
     let bearings = &model.rays[image.index()].bearings;
-    let shared = model.input.pairs.iter().filter_map(|pair| {
-        let (other, _) = pair.seen_from(image)?;
-        let image_from_other =
-            world_from_camera.inverse() * model.poses[other.index()].as_ref()?.world_from_camera;
-        let is_for = is_for(model, pair, image, &image_from_other, max_error_sigma);
-        is_for.then(|| pair.matches_from(image))
-    });
-    let shared: Vec<Match> = shared.flatten().collect();
-    direction::spread(shared.iter().filter_map(|m| bearings.get(m.first as usize)))
+    let matches: Vec<Match> =
+        said.flat_map(|said| &said.agreeing_pairs).flat_map(|pair| pair.matches_from(image)).collect();
+    direction::spread(matches.iter().filter_map(|m| bearings.get(m.first as usize)))
 }
 
 /// Whether a pair is for a pose of `image`, one of the two, relative to the other.
@@ -349,25 +338,30 @@ impl Strength {
 
 /// The geometries of one pair: the strongest that agrees with the poses of both images and the strongest that does not.
 #[derive(Debug, Default)]
-struct PairSays {
+struct PairSays<'p> {
     agreeing: Strength,
     refused: Strength,
+    /// All that agree.
+    agreeing_pairs: Vec<&'p PairGeometry>,
 }
 
 /// What those pairs say that `counts` chooses; without a pose nothing agrees.
-fn ask(
-    model: &Model<'_>,
+fn ask<'p>(
+    model: &Model<'p>,
     counts: impl Fn(&PairGeometry) -> bool,
     pose: impl Fn(ImageId) -> Option<Rigid>,
     max_error_sigma: f64,
-) -> BTreeMap<[ImageId; 2], PairSays> {
-    let mut said: BTreeMap<[ImageId; 2], PairSays> = BTreeMap::new();
+) -> BTreeMap<[ImageId; 2], PairSays<'p>> {
+    let mut said: BTreeMap<[ImageId; 2], PairSays<'p>> = BTreeMap::new();
     for pair in model.input.pairs.iter().filter(|pair| counts(pair)) {
         let agrees = pose(pair.first).zip(pose(pair.second)).is_some_and(|(first, second)| {
             is_for(model, pair, pair.second, &(second.inverse() * first), max_error_sigma)
         });
         let said = said.entry([pair.first, pair.second]).or_default();
         let strength = Strength { matches: pair.two_view.inliers.len(), spread: spread(model, pair) };
+        if agrees {
+            said.agreeing_pairs.push(pair);
+        }
         let most = if agrees { &mut said.agreeing } else { &mut said.refused };
         *most = most.max(strength);
     }

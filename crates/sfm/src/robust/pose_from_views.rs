@@ -111,8 +111,7 @@ impl LeastSquares<6> for FitToViews<'_, '_> {
             let Some((relative, _)) = constraint.sought_from_known(model) else { continue };
             let data = &constraint.matches;
             for i in 0..data.second.len() {
-                let term = data.sampson(&relative, i);
-                cost += cauchy(term.error * term.error / term.variance, data.inverse_scale_squared).0;
+                cost += data.loss(&relative, i);
             }
         }
         cost
@@ -132,13 +131,9 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
-    use crate::synthetic::{normal, random_unit, seeded};
+    use crate::synthetic::{perturb, random_unit, seeded};
 
     const SIGMA: f64 = 0.5 / 800.0;
-
-    fn noisy(direction: &Vector3<f64>, rng: &mut ChaCha8Rng) -> Vector3<f64> {
-        (direction.normalize() + SIGMA * Vector3::from_fn(|_, _| normal(rng))).normalize()
-    }
 
     /// Views of a few places, each with points of its own in common with the sought one.
     fn views(centers: &[[f64; 3]], sought: &Rigid, rng: &mut ChaCha8Rng) -> Vec<KnownView> {
@@ -147,7 +142,8 @@ mod tests {
             let world_from_camera = Rigid::new(rotation, Vector3::from(*center));
             let points: Vec<Vector3<f64>> = (0..40).map(|_| 4.0 * random_unit(rng)).collect();
             let mut seen = |from: &Rigid| -> Vec<Vector3<f64>> {
-                points.iter().map(|point| noisy(&from.inverse_transform_point(point), rng)).collect()
+                let direction = |point| from.inverse_transform_point(point).normalize();
+                points.iter().map(|point| perturb(rng, &direction(point), SIGMA)).collect()
             };
             KnownView {
                 bearings: seen(&world_from_camera),

@@ -239,6 +239,13 @@ impl<'a> RelativeMatches<'a> {
         Sampson { rotated, error, variance, along_second, along_first }
     }
 
+    /// Cauchy loss of the residual.
+    #[inline(always)]
+    pub fn loss(&self, model: &SecondFromFirst, index: usize) -> f64 {
+        let term = self.sampson(model, index);
+        cauchy(term.error * term.error / term.variance, self.inverse_scale_squared).0
+    }
+
     /// [`Consensus::squared_residual`].
     #[inline(always)]
     fn squared_residual(&self, model: &SecondFromFirst, index: usize, bound: f64) -> f64 {
@@ -298,12 +305,7 @@ impl LeastSquares<5> for RelativeFit<'_> {
     }
 
     fn cost(&self, model: &SecondFromFirst) -> f64 {
-        let mut cost = 0.0;
-        for index in self.inliers {
-            let term = self.data.sampson(model, *index as usize);
-            cost += cauchy(term.error * term.error / term.variance, self.data.inverse_scale_squared).0;
-        }
-        cost
+        self.inliers.iter().map(|index| self.data.loss(model, *index as usize)).sum()
     }
 
     fn step(&self, model: &SecondFromFirst, delta: &SVector<f64, 5>) -> SecondFromFirst {

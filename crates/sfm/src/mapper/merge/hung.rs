@@ -118,36 +118,33 @@ impl<'a> Attempt<'_, '_, 'a> {
     }
 
     /// The similarity by a pair across, with its length in both parts, below whose images these floors are.
+    ///
+    /// Where nothing beside the pair's matches tells its length in one of the parts, the other's and both floors do.
     fn by_pair(
         &self,
         pair: &PairGeometry,
-        [kept_floor, moved_floor]: [Option<Floor>; 2],
+        floors: [Option<Floor>; 2],
     ) -> Option<(Similarity, [BaselineLength; 2])> {
-        let (kept, moved) = (self.sides.kept, self.sides.moved);
-        let (of_kept, of_moved) = if kept.is_registered(pair.first) {
-            (pair.first, pair.second)
-        } else {
-            (pair.second, pair.first)
+        let sides = [self.sides.kept, self.sides.moved];
+        let is_kept_first = sides[0].is_registered(pair.first);
+        let ends = if is_kept_first { [pair.first, pair.second] } else { [pair.second, pair.first] };
+        let beside = |from: usize| {
+            let to = 1 - from;
+            let (_, to_from_from) = pair.seen_from(ends[to])?;
+            let (rays, matches) = (&sides[to].rays[ends[to].index()], pair.matches_from(ends[from]));
+            depths::step(sides[from], floors[from], [ends[from], ends[to]], rays, &to_from_from, &matches)
         };
-        let step = |model: &Model<'_>, floor, from: ImageId, to: ImageId, to_side: &Model<'_>| {
-            let (_, to_from_from) = pair.seen_from(to)?;
-            let rays = &to_side.rays[to.index()];
-            depths::step(model, floor, [from, to], rays, &to_from_from, &pair.matches_from(from))
+        let steps = [beside(0), beside(1)];
+        let by_floors = |from: usize| {
+            let to = 1 - from;
+            let (_, to_from_from) = pair.seen_from(ends[to])?;
+            let (floors, images) = ([floors[from]?, floors[to]?], [ends[from], ends[to]]);
+            depths::step_by_floors(sides[from], floors, images, &to_from_from, steps[to].as_ref()?)
         };
-        let by_floors = |model: &Model<'_>, floors: [Option<Floor>; 2], from: ImageId, to: ImageId, known| {
-            let [Some(floor), Some(known_floor)] = floors else { return None };
-            let (_, to_from_from) = pair.seen_from(to)?;
-            depths::step_by_floors(model, [floor, known_floor], [from, to], &to_from_from, known)
-        };
-        let by_kept = step(kept, kept_floor, of_kept, of_moved, moved);
-        let by_moved = step(moved, moved_floor, of_moved, of_kept, kept);
-        let (kept_step, kept_length) = by_kept
-            .or_else(|| by_floors(kept, [kept_floor, moved_floor], of_kept, of_moved, by_moved.as_ref()?))?;
-        let (moved_step, moved_length) = by_moved
-            .or_else(|| by_floors(moved, [moved_floor, kept_floor], of_moved, of_kept, by_kept.as_ref()?))?;
-        let pose = |model: &Model<'_>, image: ImageId| Some(model.poses[image.index()]?.world_from_camera);
-        let in_kept = pose(kept, of_kept)? * kept_step;
-        let in_moved = pose(moved, of_moved)?;
+        let [kept, moved] = [0, 1].map(|from| steps[from].or_else(|| by_floors(from)));
+        let ((kept_step, kept_length), (moved_step, moved_length)) = (kept?, moved?);
+        let pose = |at: usize| Some(sides[at].poses[ends[at].index()]?.world_from_camera);
+        let (in_kept, in_moved) = (pose(0)? * kept_step, pose(1)?);
         let rotation = in_kept.rotation * in_moved.rotation.inverse();
         let scale = kept_step.translation.norm() / moved_step.translation.norm();
         let translation = in_kept.translation - rotation * in_moved.translation * scale;
