@@ -3,6 +3,7 @@
 mod auc;
 mod baseline;
 mod calibration;
+mod compare;
 mod figures;
 mod harness;
 mod html;
@@ -15,6 +16,7 @@ mod tables;
 pub use auc::{AUC_THRESHOLDS_DEG, auc_percent};
 pub use baseline::{Baseline, Delta, Judgement};
 pub use calibration::{Calibration, NormalizedError};
+pub use compare::{Comparison, Frame, comparison_table};
 pub use figures::{Alignment, Bounds, Errors, PoseError, SceneFigures, Spread};
 pub use harness::{Harness, HarnessRun, about};
 pub use html::{figures_section, html_report};

@@ -5,6 +5,7 @@ mod batch;
 mod bench;
 mod build;
 mod cache;
+mod compare;
 mod demo;
 mod export;
 mod import;
@@ -61,6 +62,7 @@ fn dispatch(command: &Command) -> anyhow::Result<Answer> {
         Command::Plan(args) => build::plan(args),
         Command::Locate(args) => locate::run(args),
         Command::Bench(args) => bench::run(args),
+        Command::Compare(args) => compare::run(args),
         Command::Batch(args) => batch::run(args),
         Command::Report(args) => report::run(args),
         Command::Status(args) => status::run(args),

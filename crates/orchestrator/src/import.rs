@@ -1,16 +1,24 @@
-//! Models of other programs.
+//! Models and poses of other programs.
+
+mod colmap_binary;
+mod colmap_text;
+mod poses;
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use anyhow::{Context, Result};
-use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use anyhow::Result;
 use serde_json::{Value, json};
 use setloc_features::Camera;
 use setloc_sfm::Rigid;
 
+pub use self::poses::read_poses;
+
 use crate::error::Hinted;
 use crate::export::pose_json;
+
+/// Camera number and pose (`world_from_camera`) by image name.
+type Images = BTreeMap<String, (u32, Rigid)>;
 
 /// Cameras and poses of a model.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -22,43 +30,23 @@ pub struct ImportedModel {
 }
 
 impl ImportedModel {
-    /// Reads `cameras.txt` and `images.txt` of COLMAP's text model.
+    /// Reads a COLMAP model: `cameras` and `images`, binary where there are such files, as COLMAP itself does, else text.
     ///
     /// # Errors
-    /// With file and line.
+    /// With file and place.
     pub fn read_colmap(folder: &Path) -> Result<Self> {
-        let read = |name: &str| {
-            let path = folder.join(name);
-            std::fs::read_to_string(&path).map_err(|error| {
-                let error = anyhow::Error::new(error).context(format!("cannot read {}", path.display()));
-                let hint =
-                    "name a text model; `colmap model_converter --output_type TXT` makes one of a binary";
-                Hinted::wrap(error, hint)
-            })
+        let format = ColmapFormat::of(folder)?;
+        let images = format.images(folder)?;
+        let file = folder.join(format.file("cameras"));
+        let cameras = match format {
+            ColmapFormat::Binary => colmap_binary::cameras(&file)?,
+            ColmapFormat::Text => colmap_text::cameras(&file)?,
         };
-        let mut model = Self::default();
-        for (at, line) in read("cameras.txt")?.lines().enumerate() {
-            if is_content(line) {
-                let place = || format!("{}, line {}", folder.join("cameras.txt").display(), at + 1);
-                let (number, camera) = parse_camera(line).with_context(place)?;
-                model.cameras.insert(number, camera);
-            }
+        for (name, (camera, _)) in &images {
+            let known = cameras.contains_key(camera);
+            anyhow::ensure!(known, "{} has no camera {camera}, which {name} was taken with", file.display());
         }
-        let text = read("images.txt")?;
-        let mut lines = text.lines().enumerate();
-        while let Some((at, line)) = lines.next() {
-            if !is_content(line) {
-                continue;
-            }
-            // Each image has a second line of points, which may be empty.
-            lines.next();
-            let place = || format!("{}, line {}", folder.join("images.txt").display(), at + 1);
-            let (name, number, pose) = parse_image(line).with_context(place)?;
-            let known = model.cameras.contains_key(&number);
-            anyhow::ensure!(known, "{}: cameras.txt has no camera {number}", place());
-            model.images.insert(name, (number, pose));
-        }
-        Ok(model)
+        Ok(Self { cameras, images })
     }
 
     /// As `cameras.json`; `prefix` is put before the images' names.
@@ -82,55 +70,53 @@ impl ImportedModel {
     }
 }
 
-fn is_content(line: &str) -> bool {
-    !line.trim().is_empty() && !line.trim_start().starts_with('#')
+/// How a COLMAP model is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum ColmapFormat {
+    Binary,
+    Text,
 }
 
-/// `CAMERA_ID MODEL WIDTH HEIGHT PARAMS…`
-fn parse_camera(line: &str) -> Result<(u32, Camera)> {
-    let fields: Vec<&str> = line.split_whitespace().collect();
-    let [number, model, width, height, params @ ..] = &fields[..] else {
-        anyhow::bail!("a camera has number, model, width, height and parameters");
-    };
-    let params = params.iter().map(|text| finite(text)).collect::<Result<Vec<f64>>>()?;
-    let (width, height): (u32, u32) = (width.parse()?, height.parse()?);
-    let camera: Camera = serde_json::from_value(
-        json!({ "model": model, "width": width, "height": height, "params": params }),
-    )?;
-    camera.validate()?;
-    Ok((number.parse()?, camera))
-}
-
-/// `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, the pose camera-from-world.
-fn parse_image(line: &str) -> Result<(String, u32, Rigid)> {
-    // The name may hold blanks.
-    let mut name = line.trim();
-    let mut fields = Vec::new();
-    while let Some((field, rest)) = name.split_once(char::is_whitespace).filter(|_| fields.len() < 9) {
-        fields.push(field);
-        name = rest.trim_start();
+impl ColmapFormat {
+    /// That of the model in a folder.
+    fn of(folder: &Path) -> Result<Self> {
+        let in_folder = |folder: &Path| {
+            let is_there = |format: &Self| folder.join(format.file("images")).is_file();
+            [Self::Binary, Self::Text].into_iter().find(is_there)
+        };
+        in_folder(folder).ok_or_else(|| {
+            // COLMAP numbers the models of a place.
+            let numbered = ["0", "sparse/0", "sparse"].map(|below| folder.join(below));
+            let below = numbered.iter().find(|below| in_folder(below).is_some());
+            let hint = below.map_or_else(
+                || "name the folder of a COLMAP model".to_owned(),
+                |below| format!("there is one in {}", below.display()),
+            );
+            Hinted::error(format!("{} has neither images.bin nor images.txt", folder.display()), hint)
+        })
     }
-    let [_, numbers @ .., camera] = &fields[..] else {
-        anyhow::bail!("an image has number, rotation, translation, camera and name");
-    };
-    let numbers = numbers.iter().map(|text| finite(text)).collect::<Result<Vec<f64>>>()?;
-    let [w, x, y, z, tx, ty, tz] = numbers[..] else {
-        anyhow::bail!("an image has 4 numbers of rotation and 3 of translation");
-    };
-    let rotation =
-        UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6).context("the rotation is zero")?;
-    let camera_from_world = Rigid::new(rotation, Vector3::new(tx, ty, tz));
-    Ok((name.to_owned(), camera.parse()?, camera_from_world.inverse()))
-}
 
-fn finite(text: &str) -> Result<f64> {
-    let value: f64 = text.parse().with_context(|| format!("`{text}` is no number"))?;
-    anyhow::ensure!(value.is_finite(), "`{text}` is no finite number");
-    Ok(value)
+    /// The file of a part of a model.
+    fn file(self, part: &str) -> String {
+        let extension = match self {
+            Self::Binary => "bin",
+            Self::Text => "txt",
+        };
+        format!("{part}.{extension}")
+    }
+
+    fn images(self, folder: &Path) -> Result<Images> {
+        let file = folder.join(self.file("images"));
+        match self {
+            Self::Binary => colmap_binary::images(&file),
+            Self::Text => colmap_text::images(&file),
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::{UnitQuaternion, Vector3};
     use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage};
 
     use super::*;
@@ -192,8 +178,21 @@ mod tests {
         assert!(error_of(good, "1 1 0 0 0 0 0 x 1 a.jpg\n").contains("images.txt, line 1"));
         assert!(error_of(good, "1 1 0 0 0 0 0 0 1\n").contains("images.txt, line 1"));
         assert!(error_of(good, "1 0 0 0 0 0 0 0 1 a.jpg\n").contains("rotation is zero"));
-        assert!(
-            error_of(good, "\n1 1 0 0 0 0 0 0 2 a.jpg\n").contains("line 2: cameras.txt has no camera 2")
-        );
+        let lost = error_of(good, "\n1 1 0 0 0 0 0 0 2 a.jpg\n");
+        assert!(lost.contains("cameras.txt has no camera 2, which a.jpg was taken with"), "{lost}");
+    }
+
+    #[test]
+    fn a_folder_without_a_model_is_said_and_where_one_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let hint = || {
+            let error = ImportedModel::read_colmap(folder.path()).unwrap_err();
+            error.downcast_ref::<Hinted>().unwrap().hint().to_owned()
+        };
+        assert_eq!(hint(), "name the folder of a COLMAP model");
+        let below = folder.path().join("sparse/0");
+        std::fs::create_dir_all(&below).unwrap();
+        std::fs::write(below.join("images.bin"), [0; 8]).unwrap();
+        assert!(hint().contains("sparse/0"));
     }
 }

@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 
-use nalgebra::{Matrix3, Matrix6, Vector3};
+use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector3};
 use serde::Serialize;
 use setloc_features::ImageFeatures;
 use setloc_sfm::{Observation, Reconstruction, ReconstructionPoint, Rigid, Similarity, nearest_rotation};
@@ -67,23 +67,37 @@ pub struct Alignment {
     truth_from_scene: Similarity,
     /// By centres and rotations alike.
     by_poses: Similarity,
+    /// Images that it leaves out, as they are misplaced.
+    misplaced: Vec<String>,
 }
 
 impl Alignment {
+    /// Of poses that are in the truth's frame.
+    pub fn none() -> Self {
+        let same =
+            Similarity { scale: 1.0, rotation: UnitQuaternion::identity(), translation: Vector3::zeros() };
+        Self { truth_from_scene: same, by_poses: same, misplaced: Vec::new() }
+    }
+
     /// Units of the truth in one of the scene.
     pub fn scale(&self) -> f64 {
         self.truth_from_scene.scale
     }
 
-    /// Least squares over the centres of the images that both know; `None` with fewer than 3 or all in one line.
+    /// Images farther than a twentieth of the true extent from where most others say that they are. One in a wrong place
+    /// would move what least squares make of all, and with it the error of every photo.
+    pub fn misplaced(&self) -> &[String] {
+        &self.misplaced
+    }
+
+    /// Least squares over the centres of the images that both know, without those that are misplaced; `None` with fewer
+    /// than 3 or all in one line.
     pub fn of_centres(estimated: &BTreeMap<String, Rigid>, truth: &BTreeMap<String, Rigid>) -> Option<Self> {
-        let common = estimated
-            .iter()
-            .filter_map(|(name, pose)| Some((pose.translation, truth.get(name)?.translation)));
-        let (source, target): (Vec<_>, Vec<_>) = common.unzip();
-        let truth_from_scene = Similarity::from_point_pairs(&source, &target)?;
-        let by_poses = by_poses(estimated, truth).unwrap_or(truth_from_scene);
-        Some(Self { truth_from_scene, by_poses })
+        let mut common = common(estimated, truth);
+        let misplaced = set_misplaced_aside(&mut common);
+        let truth_from_scene = by_centres(&common)?;
+        let by_poses = by_poses(&common).unwrap_or(truth_from_scene);
+        Some(Self { truth_from_scene, by_poses, misplaced })
     }
 
     /// Of a component of few images: over the centres where they spread in two directions, else over centres and
@@ -92,13 +106,14 @@ impl Alignment {
         estimated: &BTreeMap<String, Rigid>,
         truth: &BTreeMap<String, Rigid>,
     ) -> Option<Self> {
-        let centers = estimated.iter().filter(|(name, _)| truth.contains_key(*name));
-        let centers: Vec<_> = centers.map(|(_, pose)| pose.translation).collect();
+        let mut common = common(estimated, truth);
+        let centers: Vec<_> = common.iter().map(|image| image.own.translation).collect();
         if spread_sideways(&centers) >= MIN_SIDEWAYS {
             return Self::of_centres(estimated, truth);
         }
-        let by_poses = by_poses(estimated, truth)?;
-        Some(Self { truth_from_scene: by_poses, by_poses })
+        let misplaced = set_misplaced_aside(&mut common);
+        let by_poses = by_poses(&common)?;
+        Some(Self { truth_from_scene: by_poses, by_poses, misplaced })
     }
 
     /// The error of a pose.
@@ -140,15 +155,89 @@ fn spread_sideways(points: &[Vector3<f64>]) -> f64 {
     if squares[2] > 0.0 { (squares[1] / squares[2]).sqrt() } else { 0.0 }
 }
 
+/// A pose in the scene and the true one.
+struct Compared<'a> {
+    name: &'a str,
+    own: &'a Rigid,
+    true_: &'a Rigid,
+}
+
+fn common<'a>(
+    estimated: &'a BTreeMap<String, Rigid>,
+    truth: &'a BTreeMap<String, Rigid>,
+) -> Vec<Compared<'a>> {
+    estimated.iter().filter_map(|(name, own)| Some(Compared { name, own, true_: truth.get(name)? })).collect()
+}
+
+/// Share of the true extent from where it belongs beyond which an image is misplaced.
+const MISPLACED: f64 = 0.05;
+/// Most comparisons of an image with a similarity that one image and its distance to another give.
+const MOST_COMPARISONS: usize = 10_000_000;
+
+/// Takes out the images that are misplaced, and names them.
+///
+/// Where all are near where least squares of all have them, none is. Otherwise one image's pose and its distance to
+/// another tell a similarity; of these the one counts by which most are near.
+fn set_misplaced_aside(common: &mut Vec<Compared<'_>>) -> Vec<String> {
+    let apart = |a: &Compared<'_>, b: &Compared<'_>| (a.true_.translation - b.true_.translation).norm();
+    let extent = common.iter().flat_map(|a| common.iter().map(|b| apart(a, b))).fold(0.0, f64::max);
+    let is_near = |image: &Compared<'_>, truth_from_scene: &Similarity| {
+        let found = truth_from_scene.transform_point(&image.own.translation);
+        (found - image.true_.translation).norm() <= MISPLACED * extent
+    };
+    let of_all = by_centres(common).or_else(|| by_poses(common));
+    if of_all.is_none_or(|of_all| common.iter().all(|image| is_near(image, &of_all))) {
+        return Vec::new();
+    }
+    let of_two = |a: &Compared<'_>, b: &Compared<'_>| {
+        let length = (a.own.translation - b.own.translation).norm();
+        let rotation = a.true_.rotation * a.own.rotation.inverse();
+        let scale = apart(a, b) / length;
+        let translation = a.true_.translation - rotation * a.own.translation * scale;
+        (length > 0.0 && scale > 0.0).then_some(Similarity { scale, rotation, translation })
+    };
+    let count = common.len();
+    let step = (count.pow(3) / MOST_COMPARISONS).max(1);
+    let of_two = |pair: usize| of_two(&common[pair / count], &common[pair % count]);
+    let near = |truth_from_scene: &Similarity| -> Vec<bool> {
+        common.iter().map(|image| is_near(image, truth_from_scene)).collect()
+    };
+    let by_most = (0..count * count)
+        .step_by(step)
+        .filter_map(of_two)
+        .map(|of_two| near(&of_two))
+        // Of several the first.
+        .reduce(|most, next| if counted(&next) > counted(&most) { next } else { most });
+    let Some(is_placed) = by_most.filter(|is_placed| counted(is_placed) >= MIN_PLACED) else {
+        return Vec::new();
+    };
+    let misplaced = common.iter().zip(&is_placed).filter(|(_, is_placed)| !**is_placed);
+    let misplaced = misplaced.map(|(image, _)| image.name.to_owned()).collect();
+    let mut is_placed = is_placed.into_iter();
+    common.retain(|_| is_placed.next().unwrap_or(true));
+    misplaced
+}
+
+/// Images that must agree on where they are before others count as misplaced.
+const MIN_PLACED: usize = 3;
+
+fn counted(which: &[bool]) -> usize {
+    which.iter().filter(|is_one| **is_one).count()
+}
+
+fn by_centres(common: &[Compared<'_>]) -> Option<Similarity> {
+    let (source, target): (Vec<_>, Vec<_>) =
+        common.iter().map(|image| (image.own.translation, image.true_.translation)).unzip();
+    Similarity::from_point_pairs(&source, &target)
+}
+
 /// The similarity of least squares over centres, in units of their extent, and rotations, in radians.
-fn by_poses(estimated: &BTreeMap<String, Rigid>, truth: &BTreeMap<String, Rigid>) -> Option<Similarity> {
-    let pairs: Vec<(&Rigid, &Rigid)> =
-        estimated.iter().filter_map(|(name, pose)| Some((pose, truth.get(name)?))).collect();
-    let count = pairs.len() as f64;
-    let middle =
-        |of: fn(&(&Rigid, &Rigid)) -> Vector3<f64>| pairs.iter().map(of).sum::<Vector3<f64>>() / count;
-    let (own, true_) = (middle(|(own, _)| own.translation), middle(|(_, true_)| true_.translation));
-    let offsets = || pairs.iter().map(|(a, b)| (a.translation - own, b.translation - true_));
+fn by_poses(common: &[Compared<'_>]) -> Option<Similarity> {
+    let count = common.len() as f64;
+    let middle = |of: fn(&Compared<'_>) -> Vector3<f64>| common.iter().map(of).sum::<Vector3<f64>>() / count;
+    let (own, true_) = (middle(|image| image.own.translation), middle(|image| image.true_.translation));
+    let offsets =
+        || common.iter().map(|image| (image.own.translation - own, image.true_.translation - true_));
     let extents = offsets().fold([0.0; 2], |[a, b], (of_own, of_true)| {
         [a + of_own.norm_squared() / count, b + of_true.norm_squared() / count]
     });
@@ -157,7 +246,7 @@ fn by_poses(estimated: &BTreeMap<String, Rigid>, truth: &BTreeMap<String, Rigid>
         offsets().map(|(of_own, of_true)| of_true * of_own.transpose()).sum::<Matrix3<f64>>()
             / (own_extent * true_extent);
     // A rotation by the angle a moves three axes by 2a² together, a centre one extent away by a².
-    let rotations = pairs.iter().map(|(own, true_)| true_.rotation * own.rotation.inverse());
+    let rotations = common.iter().map(|image| image.true_.rotation * image.own.rotation.inverse());
     let by_rotations: Matrix3<f64> =
         rotations.map(|turn| turn.to_rotation_matrix().into_inner()).sum::<Matrix3<f64>>() * 0.5;
     let rotation = nearest_rotation(by_centers + by_rotations)?;
@@ -193,6 +282,9 @@ pub struct SceneFigures {
     pub registered: usize,
     /// Number of components.
     pub components: usize,
+    /// Images of the largest component in a wrong place: more than a twentieth of the extent from where the alignment of
+    /// all others has them. Their errors count with the others.
+    pub misplaced: usize,
     /// Points of the largest component.
     pub points: usize,
     /// Observations of the largest component.
@@ -238,8 +330,6 @@ pub fn mean_angular_error_px(
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::UnitQuaternion;
-
     use super::*;
 
     #[test]
@@ -296,6 +386,41 @@ mod tests {
         assert!(Alignment::of_component(&named(0), &truth).is_none());
         let together = named(2).keys().map(|name| (name.clone(), pose(1.0))).collect();
         assert!(Alignment::of_component(&together, &truth).is_none());
+    }
+
+    #[test]
+    fn images_in_a_wrong_place_do_not_move_the_others() {
+        let turn = UnitQuaternion::from_euler_angles(0.3, -0.8, 1.2);
+        let mapped = Similarity { scale: 2.5, rotation: turn, translation: Vector3::new(4.0, 5.0, 6.0) };
+        let pose = |x: u32| {
+            let x = f64::from(x);
+            Rigid::new(
+                UnitQuaternion::from_euler_angles(0.1 * x, 0.2, -x),
+                Vector3::new(x, x * x / 10.0, 0.0),
+            )
+        };
+        let estimated: BTreeMap<String, Rigid> = (0..10).map(|at| (at.to_string(), pose(at))).collect();
+        let truth = |wrong: &[&str], by: f64| -> BTreeMap<String, Rigid> {
+            let moved = |name: &str, pose: &Rigid| {
+                let mut pose = mapped.transform_pose(pose);
+                if wrong.contains(&name) {
+                    pose.translation.z += by;
+                }
+                pose
+            };
+            estimated.iter().map(|(name, pose)| (name.clone(), moved(name, pose))).collect()
+        };
+        let far = truth(&["2", "7", "8"], 9.0);
+        let alignment = Alignment::of_centres(&estimated, &far).unwrap();
+        assert_eq!(alignment.misplaced(), ["2", "7", "8"]);
+        let error = |name: &str| alignment.error(&estimated[name], &far[name]);
+        assert!(error("3").position_m < 1e-9 && (error("7").position_m - 9.0).abs() < 1e-9);
+        let normalized = alignment.normalized_error(&estimated["3"], &Matrix6::identity(), &far["3"]);
+        assert!(normalized.unwrap().position < 1e-12);
+        // A little off is an error as any other.
+        let near = Alignment::of_centres(&estimated, &truth(&["2"], 0.3)).unwrap();
+        assert!(near.misplaced().is_empty());
+        assert!(near.error(&estimated["3"], &truth(&[], 0.0)["3"]).position_m > 0.005);
     }
 
     #[test]

@@ -168,7 +168,8 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     let model = built.scene.main().cloned().unwrap_or_default();
     let pictures = Arc::new(PictureBook::of(&folder.images));
     let estimated = poses_of(&model);
-    let true_scene = truth_of(truth.as_ref(), &format!("{kind}/"));
+    let truth_of = |prefix: &str| truth.as_ref().map_or_else(BTreeMap::new, |truth| truth.poses(prefix));
+    let true_scene = truth_of(&format!("{kind}/"));
     let alignment = Alignment::of_centres(&estimated, &true_scene);
     let scene_errors = alignment.as_ref().map_or_else(Errors::new, |a| errors_of(a, &estimated, &true_scene));
     let scene = scene_figures(
@@ -222,7 +223,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     }
     let (wall_s, cpu_s) = session.report.totals();
     let (stages, peak_rss_mb) = (session.report.stages(), crate::clock::peak_rss_mib());
-    let is_told = truth.as_ref().is_some_and(|truth| truth.names("queries/").next().is_some());
+    let is_told = !truth_of("queries/").is_empty();
     let joint_reference = if options.joint_reference && !is_told && !found.is_empty() {
         let photos: Vec<&ImageFolder> = found.iter().map(|set| &set.photos).collect();
         let name = run_name(&root.join("joint"));
@@ -241,7 +242,7 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     let reference = joint_reference.as_ref().map(|joint| &joint.poses);
     let alignments = alignments_of(&built.scene, reference.unwrap_or(&true_scene));
     let sets = found.into_iter().map(|set| {
-        let of_truth = truth_of(truth.as_ref(), &format!("queries/{}/", set.name));
+        let of_truth = truth_of(&format!("queries/{}/", set.name));
         set_figures(set, &alignments, reference.unwrap_or(&of_truth))
     });
     let sets = sets.collect();
@@ -290,11 +291,6 @@ fn set_folders(root: &Path) -> Result<Vec<PathBuf>> {
     Ok(folders)
 }
 
-fn truth_of(truth: Option<&Truth>, prefix: &str) -> BTreeMap<String, Rigid> {
-    let Some(truth) = truth else { return BTreeMap::new() };
-    truth.names(prefix).filter_map(|name| Some((name.to_owned(), truth.pose(name)?))).collect()
-}
-
 pub(super) fn poses_of(model: &Reconstruction) -> BTreeMap<String, Rigid> {
     model.images.iter().filter_map(|image| Some((image.name.clone(), image.world_from_camera?))).collect()
 }
@@ -338,6 +334,7 @@ fn scene_figures(
         images,
         registered: estimated.len(),
         components: built.scene.components.len(),
+        misplaced: alignment.map_or(0, |alignment| alignment.misplaced().len()),
         points: model.points.len(),
         observations: model.observation_count(),
         mean_angular_error_px: mean_angular_error_px(model, &built.features),

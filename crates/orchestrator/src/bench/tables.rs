@@ -76,6 +76,15 @@ fn scene_table(text: &mut String, figures: &DatasetFigures) {
         add(text, format_args!(", mean angular error {error:.3} px"));
     }
     *text += ".\n";
+    if scene.misplaced > 0 {
+        add(
+            text,
+            format_args!(
+                "\n{} of these are misplaced: more than a twentieth of the extent from where the others say that they are. Everything is aligned without them; their errors count below.\n",
+                scene.misplaced
+            ),
+        );
+    }
     let rows = [
         ("position m", scene.position_m),
         ("rotation °", scene.rotation_deg),

@@ -33,6 +33,8 @@ pub enum Command {
     Locate(LocateArgs),
     /// Build and locate data sets and compare with their truth
     Bench(BenchArgs),
+    /// Compare poses, ours or other programs', with the truth
+    Compare(CompareArgs),
     /// Build many scenes and locate many sets, from a manifest
     Batch(BatchArgs),
     /// Show what a build or a localization came to, as text and as a page
@@ -41,7 +43,7 @@ pub enum Command {
     Status(StatusArgs),
     /// Write a scene in another format
     Export(ExportArgs),
-    /// Make cameras.json and truth.json of a COLMAP text model
+    /// Make cameras.json and truth.json of a COLMAP model, binary or text
     Import(ImportArgs),
     /// Say what changed for a job or image between the last two runs
     Explain(ExplainArgs),
@@ -247,6 +249,26 @@ pub struct RegistryArgs {
     pub update_baseline: bool,
 }
 
+/// `setloc compare`
+#[derive(Debug, Clone, Args)]
+pub struct CompareArgs {
+    /// True poses, in any of these forms; images are known by name or by the end of it
+    pub truth: PathBuf,
+    /// Of each program a truth.json (or a folder that has one), a poses.json of `build`, `locate` or `bench`, a COLMAP model's
+    /// folder, or lines of name and camera-from-world pose (qw qx qy qz tx ty tz)
+    #[arg(required = true)]
+    pub poses: Vec<PathBuf>,
+    /// Align by the images whose true name starts so, as `panoramas/`, and judge the others [default: by all, and judge all]
+    #[arg(long, value_name = "PREFIX", conflicts_with = "no_align")]
+    pub align_by: Option<String>,
+    /// Poses are in the truth's frame
+    #[arg(long)]
+    pub no_align: bool,
+    /// File for all figures and each image's errors (JSON)
+    #[arg(short, long, value_name = "FILE")]
+    pub output: Option<PathBuf>,
+}
+
 /// `setloc batch`
 #[derive(Debug, Clone, Args)]
 pub struct BatchArgs {
@@ -327,7 +349,7 @@ pub struct StatusArgs {
 /// `setloc import`
 #[derive(Debug, Clone, Args)]
 pub struct ImportArgs {
-    /// Folder with cameras.txt and images.txt
+    /// Folder with cameras.bin and images.bin, or the same as .txt
     pub model: PathBuf,
     /// Folder for cameras.json (for --cameras) and truth.json (for `bench`)
     #[arg(short, long, default_value = "out")]

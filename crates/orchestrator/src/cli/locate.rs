@@ -18,7 +18,9 @@ use crate::dataset::{
     CameraBook, CameraOrigin, GeoSource, ImageFolder, SourceImage, list_images, unread_images,
 };
 use crate::error::Hinted;
-use crate::export::{Marker, localizations_json, origin_json, ply, renew_colmap, top_view_png};
+use crate::export::{
+    Marker, localizations_json, origin_json, ply, renew_colmap, scene_images_json, top_view_png,
+};
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, Mode, grow, locate};
 use crate::pictures::PictureBook;
@@ -250,7 +252,7 @@ fn write_results(
                 "camset": of_set(set.map(|set| &set.rigid)), "camset+opt": of_set(set.map(|set| &set.refined)),
             },
             "local_models": located.local_models, "advice": set.map(|set| &set.advice), "skipped": located.skipped,
-            "scene_warnings": scene.warnings,
+            "scene_images": scene_images_json(scene), "scene_warnings": scene.warnings,
         }),
     )?;
     let empty = Reconstruction::default();

@@ -7,15 +7,6 @@ use serde::Deserialize;
 use setloc_features::Wgs84;
 use setloc_sfm::Rigid;
 
-/// One image's true pose in `truth.json`.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
-pub struct TruthPose {
-    /// World-from-camera rotation, w first.
-    pub q_wxyz: [f64; 4],
-    /// Centre in the world.
-    pub center: [f64; 3],
-}
-
 /// Poses known from elsewhere: east-north-up metres.
 #[derive(Debug, Clone, Default, Deserialize)]
 pub struct Truth {
@@ -23,6 +14,29 @@ pub struct Truth {
     /// WGS84 place of the origin.
     #[serde(default)]
     pub geo_origin: Option<Wgs84>,
+}
+
+/// One image's true pose in `truth.json`.
+#[derive(Debug, Clone, Copy, Deserialize)]
+#[serde(try_from = "WrittenPose")]
+struct TruthPose(Rigid);
+
+/// The same as it is written: rotation and centre of the camera in the world.
+#[derive(Deserialize)]
+struct WrittenPose {
+    q_wxyz: [f64; 4],
+    center: [f64; 3],
+}
+
+impl TryFrom<WrittenPose> for TruthPose {
+    type Error = &'static str;
+
+    fn try_from(written: WrittenPose) -> Result<Self, Self::Error> {
+        let [w, x, y, z] = written.q_wxyz;
+        let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6);
+        let rotation = rotation.ok_or("`q_wxyz` is zero, which is no rotation")?;
+        Ok(Self(Rigid::new(rotation, Vector3::from(written.center))))
+    }
 }
 
 impl Truth {
@@ -36,19 +50,30 @@ impl Truth {
         serde_json::from_str(&text).with_context(|| format!("{} is no truth.json", path.display()))
     }
 
-    /// The true `world_from_camera` of an image.
-    pub fn pose(&self, name: &str) -> Option<Rigid> {
-        self.images.get(name).map(|pose| {
-            let [w, x, y, z] = pose.q_wxyz;
-            Rigid::new(
-                UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)),
-                Vector3::from(pose.center),
-            )
-        })
+    /// The true `world_from_camera` of the images whose name starts with `prefix`.
+    pub fn poses(&self, prefix: &str) -> BTreeMap<String, Rigid> {
+        let named = self.images.iter().filter(|(name, _)| name.starts_with(prefix));
+        named.map(|(name, pose)| (name.clone(), pose.0)).collect()
     }
+}
 
-    /// Names of images whose pose is known and whose name starts with `prefix`, sorted.
-    pub fn names<'t>(&'t self, prefix: &'t str) -> impl Iterator<Item = &'t str> {
-        self.images.keys().map(String::as_str).filter(move |name| name.starts_with(prefix))
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rotation_of_zero_is_refused_with_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("truth.json");
+        let write = |q: &str| {
+            let pose = format!(r#"{{"q_wxyz": {q}, "center": [1, 2, 3]}}"#);
+            std::fs::write(&file, format!("{{\"images\": {{\n\"a/b.jpg\": {pose}}}}}")).unwrap();
+            Truth::read(&file)
+        };
+        let truth = write("[2, 0, 0, 0]").unwrap();
+        assert!((truth.poses("a/")["a/b.jpg"].rotation.norm() - 1.0).abs() < 1e-12);
+        assert!(truth.poses("b").is_empty());
+        let error = format!("{:#}", write("[0, 0, 0, 0]").unwrap_err());
+        assert!(error.contains("no rotation") && error.contains("line 2"), "{error}");
     }
 }

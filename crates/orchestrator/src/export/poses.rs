@@ -61,6 +61,14 @@ pub fn scene_json(scene: &SceneFile) -> Value {
     })
 }
 
+/// Names and poses of a scene's images in the frame of its largest component.
+pub fn scene_images_json(scene: &SceneFile) -> Value {
+    let in_frame = scene.components.iter().enumerate().filter(|(at, _)| scene.shares_frame(*at));
+    let images = in_frame.flat_map(|(_, model)| &model.images);
+    let placed = images.filter_map(|image| Some((&image.name, image.world_from_camera.as_ref()?)));
+    placed.map(|(name, pose)| json!({ "name": name, "world_from_camera": pose_json(pose) })).collect()
+}
+
 /// One sigma of the poses of a component's images, by name: of the panoramas by what they may be off together, of photos that it has
 /// grown by as these were localized.
 fn sigmas_of(scene: &SceneFile, component: usize) -> BTreeMap<&str, Value> {

@@ -93,6 +93,7 @@ fn a_data_set_by_path_keeps_its_results_schema() {
         "components",
         "images",
         "mean_angular_error_px",
+        "misplaced",
         "observations",
         "points",
         "position_m",

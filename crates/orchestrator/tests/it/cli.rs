@@ -6,8 +6,8 @@ use crate::common::{gave, panoramas, said, setloc, town};
 fn help_says_what_there_is() {
     let folder = tempfile::tempdir().unwrap();
     let commands = [
-        "", "demo", "build", "plan", "locate", "bench", "batch", "report", "status", "export", "import",
-        "explain", "cache", "cache gc",
+        "", "demo", "build", "plan", "locate", "bench", "compare", "batch", "report", "status", "export",
+        "import", "explain", "cache", "cache gc",
     ];
     for command in commands {
         let arguments: Vec<&str> = command.split_whitespace().chain(["--help"]).collect();
@@ -27,8 +27,10 @@ fn errors_name_the_file_the_place_and_the_remedy() {
     write("config.toml", "[camset]\nrato = 0.6\n");
     write("geo.csv", "name,lat,lon,alt\np0.png,91,8,0\n");
     write("damaged.setloc", "SETLOC");
+    write("a.txt", "a.jpg 1 0 0 0 0 0 0\n");
+    write("b.txt", "b.jpg 1 0 0 0 0 0 0\n");
     write("batch.toml", "[[scene]]\nname = \"a\"\n");
-    let wrong: [&[&str]; 15] = [
+    let wrong: [&[&str]; 18] = [
         &["build"],
         &["build", "nowhere"],
         &["build", "empty"],
@@ -44,6 +46,9 @@ fn errors_name_the_file_the_place_and_the_remedy() {
         &["report", "empty"],
         &["batch", "batch.toml"],
         &["bench", "empty"],
+        &["compare", "geo.csv", "geo.csv"],
+        &["compare", "a.txt", "b.txt"],
+        &["import", "empty"],
     ];
     let mut texts = String::new();
     for arguments in wrong {
@@ -219,4 +224,29 @@ fn plan_and_explain_name_the_parameter_that_changed() {
     // Another output in the same store is another run.
     run(&["build", "town/panoramas", "-o", "other/s.setloc"], &["--cache", ".setloc-cache"]);
     assert!(run(&["explain", "features"], &[]).contains("build other/s.setloc: features"));
+}
+
+#[test]
+fn poses_are_compared_with_the_truth() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    let pose = |x: i32, y: i32| format!(r#"{{"q_wxyz": [1, 0, 0, 0], "center": [{x}, {y}, 0]}}"#);
+    let [a, b, c, photo] = [pose(0, 0), pose(2, 0), pose(0, 2), pose(2, 2)];
+    write(
+        "truth.json",
+        &format!(r#"{{"images": {{"p/a": {a}, "p/b": {b}, "p/c": {c}, "q/d": {photo}, "q/e": {photo}}}}}"#),
+    );
+    // Half as large, and the photo is off by a quarter of the truth's unit.
+    write("found.txt", "a 1 0 0 0 0 0 0\nb 1 0 0 0 -1 0 0\nc 1 0 0 0 0 -1 0\nd 1 0 0 0 -1.125 -1 0\n");
+    let output = setloc(
+        folder.path(),
+        &["compare", "truth.json", "found.txt", "--align-by", "p/", "-o", "found.json"],
+    );
+    assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+    let row = gave(&output).lines().nth(2).unwrap().to_owned();
+    let figures = "| found.txt | 1/2 | 0 | 0.2500, 0.2500, 0.2500 | 0.0000, 0.0000, 0.0000 | 50.0 |";
+    assert!(row.starts_with(figures), "{row}");
+    let found: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(folder.path().join("found.json")).unwrap()).unwrap();
+    assert!((found["comparisons"][0]["scale"].as_f64().unwrap() - 2.0).abs() < 1e-9, "{found}");
 }

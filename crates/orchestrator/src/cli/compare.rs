@@ -1,0 +1,60 @@
+use std::path::Path;
+
+use anyhow::Result;
+use serde_json::json;
+
+use super::Answer;
+use super::args::CompareArgs;
+use super::build::write_json;
+use crate::bench::{Comparison, Frame, comparison_table};
+use crate::error::Hinted;
+use crate::import::read_poses;
+use crate::print;
+
+/// `setloc compare`
+pub fn run(args: &CompareArgs) -> Result<Answer> {
+    let truth = read_poses(&args.truth)?;
+    let frame = match &args.align_by {
+        Some(prefix) => Frame::AlignedBy(prefix.clone()),
+        None if args.no_align => Frame::Same,
+        None => Frame::Aligned,
+    };
+    let mut comparisons = Vec::new();
+    for path in &args.poses {
+        let poses = read_poses(path)?;
+        let found = Comparison::of(&path.display().to_string(), &poses, &truth, &frame);
+        if found.unknown == poses.len() {
+            let first = |names: Option<&String>| names.cloned().unwrap_or_default();
+            return Err(Hinted::error(
+                format!("{} and {} name no image alike", path.display(), args.truth.display()),
+                format!(
+                    "one has `{}`, the other `{}`: names are alike where one ends in the other",
+                    first(poses.keys().next()),
+                    first(truth.keys().next())
+                ),
+            ));
+        }
+        warn(path, &found);
+        comparisons.push(found);
+    }
+    print::data(comparison_table(&comparisons).trim_end())?;
+    if let Some(output) = &args.output {
+        write_json(output, &json!({ "comparisons": comparisons }))?;
+        print::note(&format!("wrote {}", output.display()));
+    }
+    Ok(Answer::Done)
+}
+
+/// What the table does not show.
+fn warn(path: &Path, found: &Comparison) {
+    let path = path.display();
+    if found.unknown > 0 {
+        print::note(&format!(
+            "warning: {path}: the truth tells nothing of {} images, or of two names one",
+            found.unknown
+        ));
+    }
+    if found.scale.is_none() {
+        print::note(&format!("warning: {path}: too few images to align by, so nothing is told of errors"));
+    }
+}

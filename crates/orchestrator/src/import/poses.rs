@@ -1,0 +1,214 @@
+//! Poses of images, however they are written.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
+use serde_json::{Value, json};
+use setloc_camset::Verdict;
+use setloc_sfm::Rigid;
+
+use super::ColmapFormat;
+use super::colmap_text::is_content;
+use crate::dataset::Truth;
+use crate::error::Hinted;
+
+/// Reads `world_from_camera` of images by name.
+///
+/// Of a folder: its `truth.json`, or the COLMAP model in it. Of a JSON file: a `truth.json`; the `poses.json` of `build` (what is in
+/// the frame of the largest component), of `locate` (the scene's images, and what is *localized* in that frame) or of `bench`. Of any other file: lines of
+/// a name and the camera-from-world pose, as `images.txt` begins, and as hloc and the benchmarks of visuallocalization.net have them.
+///
+/// # Errors
+/// With file and place.
+pub fn read_poses(path: &Path) -> Result<BTreeMap<String, Rigid>> {
+    let poses = if path.is_dir() {
+        of_folder(path)?
+    } else {
+        let text =
+            std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
+            let json: Value =
+                serde_json::from_str(&text).with_context(|| format!("{} is no JSON", path.display()))?;
+            of_json(&json).with_context(|| path.display().to_string())?
+        } else {
+            of_lines(path, &text)?
+        }
+    };
+    if poses.is_empty() {
+        let message = format!("{} has no pose", path.display());
+        return Err(Hinted::error(
+            message,
+            "name a truth.json, a poses.json, a COLMAP model or lines of poses",
+        ));
+    }
+    Ok(poses)
+}
+
+fn of_folder(folder: &Path) -> Result<BTreeMap<String, Rigid>> {
+    let truth = folder.join("truth.json");
+    if truth.is_file() {
+        return Ok(Truth::read(&truth)?.poses(""));
+    }
+    let images = ColmapFormat::of(folder)?.images(folder)?;
+    Ok(images.into_iter().map(|(name, (_, pose))| (name, pose)).collect())
+}
+
+/// `NAME QW QX QY QZ TX TY TZ`, the pose camera-from-world.
+fn of_lines(path: &Path, text: &str) -> Result<BTreeMap<String, Rigid>> {
+    let mut poses = BTreeMap::new();
+    for (at, line) in text.lines().enumerate().filter(|(_, line)| is_content(line)) {
+        let place = || format!("{}, line {}", path.display(), at + 1);
+        // The name may hold blanks.
+        let mut name = line.trim();
+        let mut numbers = [""; 7];
+        for number in numbers.iter_mut().rev() {
+            let parted = name.rsplit_once(char::is_whitespace);
+            (name, *number) = parted.context("a line has a name and 7 numbers").with_context(place)?;
+            name = name.trim_end();
+        }
+        poses.insert(name.to_owned(), world_from_camera(&numbers).with_context(place)?);
+    }
+    Ok(poses)
+}
+
+/// A pose camera-from-world of 4 numbers of rotation (w first) and 3 of translation, turned about.
+pub(super) fn world_from_camera(numbers: &[&str]) -> Result<Rigid> {
+    let numbers = numbers.iter().map(|text| finite(text)).collect::<Result<Vec<f64>>>()?;
+    let numbers: [f64; 7] = numbers
+        .try_into()
+        .map_err(|_| anyhow::anyhow!("an image has 4 numbers of rotation and 3 of translation"))?;
+    Ok(rigid(numbers)?.inverse())
+}
+
+/// The transform of 4 numbers of rotation (w first) and 3 of translation.
+pub(super) fn rigid([w, x, y, z, tx, ty, tz]: [f64; 7]) -> Result<Rigid> {
+    anyhow::ensure!([w, x, y, z, tx, ty, tz].iter().all(|value| value.is_finite()), "a number is not finite");
+    let rotation =
+        UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6).context("the rotation is zero")?;
+    Ok(Rigid::new(rotation, Vector3::new(tx, ty, tz)))
+}
+
+pub(super) fn finite(text: &str) -> Result<f64> {
+    let value: f64 = text.parse().with_context(|| format!("`{text}` is no number"))?;
+    anyhow::ensure!(value.is_finite(), "`{text}` is no finite number");
+    Ok(value)
+}
+
+fn of_json(json: &Value) -> Result<BTreeMap<String, Rigid>> {
+    let listed = |list: &Value| -> Result<BTreeMap<String, Rigid>> {
+        let is_apart = |image: &Value| image["own_frame"] == true;
+        let localized = json!(Verdict::Localized);
+        let is_unsure = |image: &Value| image.get("verdict").is_some_and(|verdict| *verdict != localized);
+        let images =
+            list.as_array().into_iter().flatten().filter(|image| !is_apart(image) && !is_unsure(image));
+        let placed = images.filter(|image| !image["world_from_camera"].is_null());
+        placed
+            .map(|image| {
+                let name = image["name"].as_str().context("an image without a name")?;
+                let pose = of_value(&image["world_from_camera"]).with_context(|| name.to_owned())?;
+                Ok((name.to_owned(), pose))
+            })
+            .collect()
+    };
+    if let Some(components) = json["components"].as_array() {
+        let mut poses = BTreeMap::new();
+        for component in components.iter().filter(|component| component["own_frame"] != true) {
+            poses.extend(listed(&component["images"])?);
+        }
+        return Ok(poses);
+    }
+    if json["photos"].is_array() {
+        let mut poses = listed(&json["scene_images"])?;
+        poses.extend(listed(&json["photos"])?);
+        return Ok(poses);
+    }
+    let named = json.get("images").unwrap_or(json).as_object();
+    let named = named.context("neither images by name nor what `setloc` writes")?;
+    let one =
+        |(name, value): (&String, &Value)| Ok((name.clone(), of_value(value).with_context(|| name.clone())?));
+    named.iter().map(one).collect()
+}
+
+/// `{"q_wxyz", "center"}`, both of the camera in the world, or `{"R", "C"}`, of which R turns from the world into the camera.
+fn of_value(value: &Value) -> Result<Rigid> {
+    let center = numbers::<3>(value.get("center").unwrap_or(&value["C"]));
+    let [x, y, z] = center.context("`center` is not 3 numbers")?;
+    if let Some(rows) = value["R"].as_array() {
+        let rows: Vec<[f64; 3]> = rows.iter().filter_map(numbers).collect();
+        let [a, b, c] = rows[..] else { anyhow::bail!("`R` is not 3 rows of 3 numbers") };
+        let matrix = Matrix3::from_rows(&[a.into(), b.into(), c.into()]);
+        let off = (matrix * matrix.transpose() - Matrix3::identity()).norm();
+        anyhow::ensure!(off < 1e-3 && matrix.determinant() > 0.0, "`R` is no rotation");
+        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(matrix));
+        return Ok(Rigid::new(rotation.inverse(), Vector3::new(x, y, z)));
+    }
+    let [w, i, j, k] = numbers::<4>(&value["q_wxyz"]).context("`q_wxyz` is not 4 numbers")?;
+    rigid([w, i, j, k, x, y, z])
+}
+
+fn numbers<const N: usize>(value: &Value) -> Option<[f64; N]> {
+    let numbers: Option<Vec<f64>> = value.as_array()?.iter().map(Value::as_f64).collect();
+    numbers?.try_into().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(name: &str, text: &str) -> Result<BTreeMap<String, Rigid>> {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join(name), text).unwrap();
+        read_poses(&folder.path().join(name))
+    }
+
+    /// Half a turn about y at (1, 2, 3), in all notations.
+    #[test]
+    fn all_notations_tell_the_same_pose() {
+        let pose = r#"{"q_wxyz": [0, 0, 1, 0], "center": [1, 2, 3]}"#;
+        let texts = [
+            ("a.txt", "# a comment\na b.jpg 0 0 1 0  1 -2 3\n".to_owned()),
+            ("truth.json", format!(r#"{{"images": {{"a b.jpg": {pose}}}}}"#)),
+            (
+                "scene.json",
+                format!(
+                    r#"{{"components": [{{"images": [{{"name": "a b.jpg", "world_from_camera": {pose}}}, {{"name": "b", "world_from_camera": null}}], "own_frame": false}}, {{"images": [{{"name": "c", "world_from_camera": {pose}}}], "own_frame": true}}]}}"#
+                ),
+            ),
+            (
+                "photos.json",
+                format!(
+                    r#"{{"photos": [{{"name": "a b.jpg", "verdict": "localized", "own_frame": false, "world_from_camera": {pose}}}, {{"name": "b", "verdict": "uncertain", "own_frame": false, "world_from_camera": {pose}}}], "scene_images": []}}"#
+                ),
+            ),
+            ("bench.json", r#"{"a b.jpg": {"R": [[-1,0,0],[0,1,0],[0,0,-1]], "C": [1,2,3]}}"#.to_owned()),
+        ];
+        for (name, text) in texts {
+            let poses = read(name, &text).unwrap();
+            assert_eq!(poses.keys().collect::<Vec<_>>(), ["a b.jpg"], "{name}");
+            let pose = poses["a b.jpg"];
+            assert!((pose.translation - Vector3::new(1.0, 2.0, 3.0)).norm() < 1e-12, "{name}: {pose:?}");
+            let turned = pose.rotation * Vector3::new(1.0, 1.0, 1.0);
+            assert!((turned - Vector3::new(-1.0, 1.0, -1.0)).norm() < 1e-12, "{name}: {pose:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_pose_is_named_with_its_place() {
+        let error = |name: &str, text: &str| format!("{:#}", read(name, text).unwrap_err());
+        assert!(error("a.txt", "a 1 0 0 0 1 2\n").contains("a.txt, line 1: a line has a name and 7 numbers"));
+        assert!(error("a.txt", "a 1 0 0 0 1 2 x\n").contains("`x` is no number"));
+        assert!(error("a.txt", "a 0 0 0 0 1 2 3\n").contains("the rotation is zero"));
+        assert!(error("a.txt", "\n").contains("has no pose"));
+        assert!(error("a.json", "[1]").contains("a.json: neither images by name"));
+        assert!(error("a.json", "{").contains("is no JSON"));
+        assert!(
+            error("a.json", r#"{"b": {"q_wxyz": [1, 0, 0], "center": [1, 2, 3]}}"#).contains("b: `q_wxyz`")
+        );
+        assert!(
+            error("a.json", r#"{"b": {"R": [[1,0,0],[0,1,0],[0,0,2]], "C": [1, 2, 3]}}"#)
+                .contains("no rotation")
+        );
+    }
+}
