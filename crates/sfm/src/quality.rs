@@ -486,86 +486,106 @@ impl QualityReport {
     /// The report in sentences, worst first; empty when nothing disagrees.
     pub fn sentences(&self, reconstruction: &Reconstruction) -> Vec<String> {
         let name = |image: ImageId| reconstruction.images[image.index()].name.as_str();
-        let mut lines = Vec::new();
         let mut together: Vec<&SuspiciousNeighbours> = self.suspicious.iter().collect();
         together.sort_by(|a, b| a.share().total_cmp(&b.share()));
-        for pair in together.iter().take(MOST_NAMED) {
-            lines.push(format!(
-                "{} and {} stand together in the model but share {} of {} points that both ought to see: {}",
-                name(pair.first),
-                name(pair.second),
-                pair.shared,
-                pair.expected,
-                if pair.is_confirmed {
-                    "the scene may be folded there"
-                } else {
-                    "something stands between them, or the scene is folded there"
-                }
-            ));
-        }
-        if together.len() > MOST_NAMED {
-            let others = together.len() - MOST_NAMED;
-            lines.push(format!(
-                "{others} more {} together and {} next to none of the points that both ought to see",
-                if others == 1 { "pair stands" } else { "pairs stand" },
-                if others == 1 { "shares" } else { "share" },
-            ));
-        }
+        let mut lines = worst_of(&together, |pair| said_of_neighbours(pair, name), said_of_more_neighbours);
         // Those that weigh most against what holds their sides together.
         let mut heaviest: Vec<&OutvotedPair> = self.outvoted.iter().collect();
         heaviest.sort_by(|a, b| b.weight().total_cmp(&a.weight()));
-        for pair in heaviest.iter().take(MOST_NAMED) {
-            let OutvotedPair { matches, held_by, .. } = pair;
-            let (first, second) = (name(pair.first), name(pair.second));
+        let said = |pair: &OutvotedPair| {
             let is_within = reconstruction.images[pair.second.index()].world_from_camera.is_some();
-            lines.push(if is_within {
-                format!(
-                    "the {matches} matches of {first} and {second} contradict the model, which {held_by} points hold together \
-                     between them: it may be wrong there"
-                )
-            } else {
-                format!(
-                    "{first} shares {matches} matches with {second} of a larger component and {held_by} points at most with \
-                     any of its own: it may belong there"
-                )
-            });
-        }
-        if heaviest.len() > MOST_NAMED {
-            let others = heaviest.len() - MOST_NAMED;
-            lines.push(format!(
-                "{others} more {} with as few points between: it may be folded",
-                if others == 1 { "pair contradicts the model" } else { "pairs contradict the model" }
-            ));
-        }
-        for (image, points) in &self.weak_images {
-            lines.push(format!("{} is held by {points} points only", name(*image)));
-        }
-        let is_loud = |pair: &PairDisagreement| pair.is_unused() && pair.matches >= LOUD_MATCHES;
-        let many = self.disagreements.len() as f64 >= LOUD_SHARE * self.pairs as f64;
-        if !self.disagreements.is_empty() && (many || self.disagreements.iter().any(is_loud)) {
-            let mut worst: Vec<&PairDisagreement> = self.disagreements.iter().collect();
-            worst.sort_by_key(|pair| std::cmp::Reverse(pair.matches));
-            let named: Vec<String> = worst
-                .iter()
-                .map(|pair| {
-                    let PairDisagreement { matches, used, rotation_deg, .. } = **pair;
-                    let how = if pair.is_unused() {
-                        format!("{used} of {matches} matches used")
-                    } else {
-                        format!("{matches} matches, turned by {rotation_deg:.0}°")
-                    };
-                    format!("{}–{} ({how})", name(pair.first), name(pair.second))
-                })
-                .collect();
-            lines.push(format!(
-                "{} of {} verified pairs contradict the model, as repeated structure does: {}",
-                self.disagreements.len(),
-                self.pairs,
-                listed(&named, MOST_NAMED)
-            ));
-        }
+            said_of_outvoted(pair, is_within, name)
+        };
+        lines.extend(worst_of(&heaviest, said, said_of_more_outvoted));
+        lines.extend(
+            (self.weak_images.iter())
+                .map(|(image, points)| format!("{} is held by {points} points only", name(*image))),
+        );
+        lines.extend(self.said_of_disagreements(name));
         lines
     }
+
+    /// The pairs that the model contradicts, where they are many or one has many matches.
+    fn said_of_disagreements<'n>(&self, name: impl Fn(ImageId) -> &'n str) -> Option<String> {
+        let is_loud = |pair: &PairDisagreement| pair.is_unused() && pair.matches >= LOUD_MATCHES;
+        let many = self.disagreements.len() as f64 >= LOUD_SHARE * self.pairs as f64;
+        if self.disagreements.is_empty() || !(many || self.disagreements.iter().any(is_loud)) {
+            return None;
+        }
+        let mut worst: Vec<&PairDisagreement> = self.disagreements.iter().collect();
+        worst.sort_by_key(|pair| std::cmp::Reverse(pair.matches));
+        let named = worst.into_iter().map(|pair| {
+            let PairDisagreement { matches, used, rotation_deg, .. } = *pair;
+            let how = if pair.is_unused() {
+                format!("{used} of {matches} matches used")
+            } else {
+                format!("{matches} matches, turned by {rotation_deg:.0}°")
+            };
+            format!("{}–{} ({how})", name(pair.first), name(pair.second))
+        });
+        Some(format!(
+            "{} of {} verified pairs contradict the model, as repeated structure does: {}",
+            self.disagreements.len(),
+            self.pairs,
+            listed(&named.collect::<Vec<_>>(), MOST_NAMED)
+        ))
+    }
+}
+
+/// What is said of the first of some signs, and of how many more there are.
+fn worst_of<T>(
+    sorted: &[&T],
+    said: impl Fn(&T) -> String,
+    said_of_more: impl Fn(usize) -> String,
+) -> Vec<String> {
+    let (named, more) = sorted.split_at(sorted.len().min(MOST_NAMED));
+    let lines = named.iter().map(|sign| said(sign));
+    lines.chain((!more.is_empty()).then(|| said_of_more(more.len()))).collect()
+}
+
+fn said_of_neighbours<'n>(pair: &SuspiciousNeighbours, name: impl Fn(ImageId) -> &'n str) -> String {
+    let SuspiciousNeighbours { first, second, expected, shared, is_confirmed } = *pair;
+    let why = if is_confirmed {
+        "the scene may be folded there"
+    } else {
+        "something stands between them, or the scene is folded there"
+    };
+    format!(
+        "{} and {} stand together in the model but share {shared} of {expected} points that both ought to see: {why}",
+        name(first),
+        name(second),
+    )
+}
+
+fn said_of_more_neighbours(others: usize) -> String {
+    format!(
+        "{others} more {} together and {} next to none of the points that both ought to see",
+        if others == 1 { "pair stands" } else { "pairs stand" },
+        if others == 1 { "shares" } else { "share" },
+    )
+}
+
+fn said_of_outvoted<'n>(pair: &OutvotedPair, is_within: bool, name: impl Fn(ImageId) -> &'n str) -> String {
+    let (first, second) = (name(pair.first), name(pair.second));
+    let OutvotedPair { matches, held_by, .. } = pair;
+    if is_within {
+        format!(
+            "the {matches} matches of {first} and {second} contradict the model, which {held_by} points hold together \
+             between them: it may be wrong there"
+        )
+    } else {
+        format!(
+            "{first} shares {matches} matches with {second} of a larger component and {held_by} points at most with \
+             any of its own: it may belong there"
+        )
+    }
+}
+
+fn said_of_more_outvoted(others: usize) -> String {
+    format!(
+        "{others} more {} with as few points between: it may be folded",
+        if others == 1 { "pair contradicts the model" } else { "pairs contradict the model" }
+    )
 }
 
 #[cfg(test)]
