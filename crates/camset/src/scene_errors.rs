@@ -45,6 +45,9 @@ impl HeldByScene {
         // Photos in a place of stitched panoramas are mostly cut from such, too.
         let is_stitched = scene.reconstruction.cameras.iter().any(Camera::is_stretched);
         let draws: Vec<u32> = (0..errors.draws()).collect();
+        // It may lie at the optimum of another loss, and what leads to that of this one is in no draw.
+        let mut unmoved = problem.clone();
+        bundle::solve(params, &mut unmoved);
         let deviations = |&draw: &u32| {
             let mut moved = problem.clone();
             self.apply(&Draw::new(scene, errors, draw, &images), &mut moved);
@@ -54,7 +57,7 @@ impl HeldByScene {
                 displace(&mut moved, |pose| fields.get(pose as usize));
             }
             bundle::solve(params, &mut moved);
-            let pairs = problem.poses.iter().zip(&moved.poses).take(poses);
+            let pairs = unmoved.poses.iter().zip(&moved.poses).take(poses);
             pairs.map(|(a, b)| deviation(&a.world_from_camera, &b.world_from_camera)).collect::<Vec<_>>()
         };
         let moved: Vec<_> = draws.par_iter().with_max_len(1).map(deviations).collect();

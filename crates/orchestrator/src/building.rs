@@ -230,36 +230,54 @@ pub fn estimate_cameras(
     name: &str,
     inputs: SceneInputs<'_>,
 ) -> Result<(Option<Vec<SourceImage>>, RunResult)> {
-    let SceneInputs { alike, config, seed, .. } = inputs;
     if !has_guessed_cameras(inputs.images) {
         return Ok((None, RunResult::default()));
     }
     let mut images = inputs.images.to_vec();
-    // Where pairs are chosen by place, others need not be matched.
-    let by_turns = if images.iter().all(|image| image.position.is_none()) {
+    let by_turns = if asks_turns(&images) {
+        let SceneInputs { alike, config, seed, .. } = inputs;
         guess_by_turns(session, name, &mut images, alike, (&config.features, config), seed)?
     } else {
         RunResult::default()
     };
-    let images = &images;
-    let mut graph = JobGraph::default();
-    let jobs = add_first_model(&mut graph, SceneInputs { images, ..inputs })?;
-    let (told, doubtful, first) = session.run(name, &graph, |executor, run| {
-        let model = executor.load_made::<MapperOutput>(jobs.model)?;
-        let doubtful = model.as_ref().is_some_and(|model| !model.report.doubtful.is_empty());
-        let told = model.and_then(|model| with_estimated_cameras(images, &jobs, &model));
-        Ok((told, doubtful, by_turns.and(run.clone())))
-    })?;
-    let told = match told {
-        Some(told) if doubtful => told,
-        told => return Ok((told, first)),
+    let first = tell_cameras(session, name, SceneInputs { images: &images, ..inputs })?;
+    let run = by_turns.and(first.run);
+    let told = match first.told {
+        Some(told) if first.is_doubtful => told,
+        told => return Ok((told, run)),
     };
+    let second = tell_cameras(session, name, SceneInputs { images: &told, ..inputs })?;
+    Ok((Some(second.told.unwrap_or(told)), run.and(second.run)))
+}
+
+/// Whether turns on the spot are asked for focal lengths: where pairs are chosen by place, others need not be matched.
+pub fn asks_turns(images: &[SourceImage]) -> bool {
+    images.iter().all(|image| image.position.is_none())
+}
+
+/// What a first model tells of cameras.
+#[derive(Debug)]
+pub struct ToldCameras {
+    /// The images with its cameras in place of guessed ones; `None` where it tells none.
+    pub told: Option<Vec<SourceImage>>,
+    /// Whether images seem not to share a guess, which a second model with these cameras shows.
+    pub is_doubtful: bool,
+    /// What it took.
+    pub run: RunResult,
+}
+
+/// Maps images with the cameras that they have to tell those that are guessed.
+///
+/// # Errors
+/// When the run was stopped or the store cannot be written.
+pub fn tell_cameras(session: &Session, name: &str, inputs: SceneInputs<'_>) -> Result<ToldCameras> {
     let mut graph = JobGraph::default();
-    let jobs = add_first_model(&mut graph, SceneInputs { images: &told, ..inputs })?;
+    let jobs = add_first_model(&mut graph, inputs)?;
     session.run(name, &graph, |executor, run| {
         let model = executor.load_made::<MapperOutput>(jobs.model)?;
-        let better = model.and_then(|model| with_estimated_cameras(&told, &jobs, &model));
-        Ok((Some(better.unwrap_or(told)), first.and(run.clone())))
+        let is_doubtful = model.as_ref().is_some_and(|model| !model.report.doubtful.is_empty());
+        let told = model.and_then(|model| with_estimated_cameras(inputs.images, &jobs, &model));
+        Ok(ToldCameras { told, is_doubtful, run: run.clone() })
     })
 }
 

@@ -96,6 +96,10 @@ impl Manifest {
     /// # Errors
     /// With the parameter and value that are not valid.
     pub fn variants(&self, file: Option<&Path>, settings: &[String]) -> Result<Vec<Variant>> {
+        if let Some((key, _)) = self.sweep.iter().find(|(_, values)| values.is_empty()) {
+            let message = format!("[sweep] has no value for `{key}`");
+            return Err(Hinted::error(message, "list values, or leave the parameter out"));
+        }
         let variants = combinations(&self.sweep);
         for variant in &variants {
             Config::resolve(file, &[settings, &variant.settings].concat()).with_context(|| {

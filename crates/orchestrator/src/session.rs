@@ -48,8 +48,8 @@ impl Session {
 
     /// Runs a graph and hands the results to `use_results` once they are kept.
     ///
-    /// Of a run that does not come to its end, the results made so far are noted under `name`, so that garbage
-    /// collection leaves them for the next attempt.
+    /// What is done is noted under `name` every minute and where the run does not come to its end, so that garbage
+    /// collection leaves it to the run and to the next attempt.
     ///
     /// # Errors
     /// When stopped, when the store cannot be written, or as `use_results` does.
@@ -59,7 +59,7 @@ impl Session {
         graph: &JobGraph<'_>,
         use_results: impl FnOnce(&Executor<'_>, &RunResult) -> Result<R>,
     ) -> Result<R> {
-        let options = self.options();
+        let options = self.options(name);
         let executor = Executor::new(graph, &options);
         let run = self.noting_unfinished(name, &executor, executor.run())?;
         use_results(&executor, &run)
@@ -76,19 +76,20 @@ impl Session {
         graph: &JobGraph<'_>,
         meanwhile: impl FnOnce(&Executor<'_>, &RunResult) -> R,
     ) -> Result<(RunResult, R)> {
-        let options = self.options();
+        let options = self.options(name);
         let executor = Executor::new(graph, &options);
         let run = executor.run_with(|run| meanwhile(&executor, run));
         self.noting_unfinished(name, &executor, run)
     }
 
-    fn options(&self) -> RunOptions<'_> {
+    fn options<'o>(&'o self, name: &'o str) -> RunOptions<'o> {
         RunOptions {
             store: &self.store,
             observer: &self.observer,
             threads: self.limits.threads,
             memory: self.limits.memory,
             stop: &self.stop,
+            noted_as: Some(name),
         }
     }
 

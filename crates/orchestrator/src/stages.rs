@@ -15,16 +15,19 @@ pub use setloc_features::{
 pub const FEATURES_VERSION: u32 = FeatureParams::VERSION;
 /// Version of matching.
 pub const MATCHING_VERSION: u32 = MatchParams::VERSION;
-/// Version of the comparison of all images by their strongest keypoints.
-pub const LIKELY_VERSION: u32 = 2;
+/// Version of the comparison of all images by their strongest keypoints, and of the matching in it.
+pub const LIKELY_VERSION: u32 = 1000 * MATCHING_VERSION + 2;
 /// Version of what is said of a model's components.
-pub const LEFT_APART_VERSION: u32 = 1;
+///
+/// 2: of images that have features.
+pub const LEFT_APART_VERSION: u32 = 2;
 /// Version of two-view verification.
 pub const VERIFY_VERSION: u32 = setloc_sfm::TWO_VIEW_VERSION;
 /// Version of focal lengths by turns on the spot.
 pub const TURNED_VERSION: u32 = 1;
-/// Version of mapping and of the guided matching in it.
-pub const MAPPER_VERSION: u32 = 1000 * setloc_features::GuidedParams::VERSION + setloc_sfm::MAPPER_VERSION;
+/// Version of mapping, and of the guided matching and verification in it.
+pub const MAPPER_VERSION: u32 =
+    100_000 * VERIFY_VERSION + 1000 * setloc_features::GuidedParams::VERSION + setloc_sfm::MAPPER_VERSION;
 /// Version of the alignment of tracks.
 pub const ALIGNMENT_VERSION: u32 = setloc_sfm::ALIGNMENT_VERSION;
 /// Version of indexing.
@@ -47,10 +50,12 @@ pub const SCENE_VERSION: u32 = 31;
 pub const NEAREST_VERSION: u32 = setloc_index::VERSION;
 /// Version of single-photo localization.
 pub const SINGLE_VERSION: u32 = setloc_camset::VERSION;
-/// Version of set localization.
-pub const CAMSET_VERSION: u32 = setloc_camset::VERSION;
+/// Version of set localization, and of the matching and verification of photos with the scene's images in it.
+pub const CAMSET_VERSION: u32 = 100_000 * VERIFY_VERSION + 1000 * MATCHING_VERSION + setloc_camset::VERSION;
 /// Version of the growth of scenes.
 pub const GROW_VERSION: u32 = setloc_camset::GROWTH_VERSION;
+/// Version of the file of a scene that has grown.
+pub const GROWN_VERSION: u32 = 100_000 * GROW_VERSION + 1000 * INDEX_VERSION + SCENE_VERSION;
 
 /// JPEG quality of the sample town.
 const SAMPLE_QUALITY: u8 = 92;

@@ -11,11 +11,52 @@ use setloc_sfm::robust::TurnedCamera;
 use crate::artifacts::TurnedPair;
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, SourceImage};
-use crate::graph::{JobGraph, RunResult};
+use crate::graph::{JobGraph, JobId, RunResult};
 use crate::jobs::{PairSource, add_features_of, add_turned, choose_pairs};
 use crate::session::Session;
 use crate::stages::FeatureParams;
 use crate::text::some_of;
+
+/// The jobs that show focal lengths by turns on the spot.
+pub struct TurnedJobs<'g> {
+    /// Features, matches and turns.
+    pub graph: JobGraph<'g>,
+    /// Images that share a guess that rests on nothing.
+    groups: Vec<Vec<usize>>,
+    /// Pairs of them, and their jobs.
+    pairs: Vec<((usize, usize), JobId)>,
+}
+
+impl TurnedJobs<'_> {
+    /// Of images, `None` where no two share a guess that rests on nothing.
+    pub fn of(
+        images: &[SourceImage],
+        alike: &[(usize, usize)],
+        (features, config): (&FeatureParams, &Config),
+        seed: u64,
+    ) -> Option<Self> {
+        let groups = groups_of(images);
+        let group_of = |at: usize| groups.iter().position(|group| group.contains(&at));
+        let mut pairs = choose_pairs(&config.pairs, &vec![None; images.len()], alike);
+        pairs.retain(|&(a, b)| group_of(a).is_some_and(|group| group_of(b) == Some(group)));
+        if pairs.is_empty() {
+            return None;
+        }
+        let mut graph = JobGraph::default();
+        let features = add_features_of(&mut graph, images, features);
+        let add = |pair: (usize, usize)| {
+            let job = add_turned(&mut graph, PairSource { images, config, seed }, &features, pair);
+            graph.want(job);
+            (pair, job)
+        };
+        let pairs = pairs.into_iter().map(add).collect();
+        Some(Self { graph, groups, pairs })
+    }
+
+    fn group_of(&self, image: usize) -> Option<usize> {
+        self.groups.iter().position(|group| group.contains(&image))
+    }
+}
 
 /// Puts the focal lengths that turns on the spot show in place of guesses that rest on nothing; they stay guesses.
 ///
@@ -26,37 +67,23 @@ pub fn guess_by_turns(
     name: &str,
     images: &mut [SourceImage],
     alike: &[(usize, usize)],
-    (features, config): (&FeatureParams, &Config),
+    params: (&FeatureParams, &Config),
     seed: u64,
 ) -> Result<RunResult> {
-    let groups = groups_of(images);
-    let group_of = |at: usize| groups.iter().position(|group| group.contains(&at));
-    let mut pairs = choose_pairs(&config.pairs, &vec![None; images.len()], alike);
-    pairs.retain(|&(a, b)| group_of(a).is_some_and(|group| group_of(b) == Some(group)));
-    if pairs.is_empty() {
-        return Ok(RunResult::default());
-    }
-    let mut graph = JobGraph::default();
-    let features = add_features_of(&mut graph, images, features);
-    let mut jobs = Vec::new();
-    for &pair in &pairs {
-        let job = add_turned(&mut graph, PairSource { images, config, seed }, &features, pair);
-        graph.want(job);
-        jobs.push(job);
-    }
-    session.run(name, &graph, |executor, run| {
-        let mut shown: Vec<Vec<TurnedCamera>> = vec![Vec::new(); groups.len()];
-        for (&(first, _), job) in pairs.iter().zip(&jobs) {
-            let made = executor.load_made::<TurnedPair>(*job)?;
-            if let (Some(group), Some(turned)) = (group_of(first), made.and_then(|pair| pair.0)) {
+    let Some(jobs) = TurnedJobs::of(images, alike, params, seed) else { return Ok(RunResult::default()) };
+    session.run(name, &jobs.graph, |executor, run| {
+        let mut shown: Vec<Vec<TurnedCamera>> = vec![Vec::new(); jobs.groups.len()];
+        for &((first, _), job) in &jobs.pairs {
+            let made = executor.load_made::<TurnedPair>(job)?;
+            if let (Some(group), Some(turned)) = (jobs.group_of(first), made.and_then(|pair| pair.0)) {
                 shown[group].push(turned);
             }
         }
-        for (group, turned) in groups.iter().zip(&shown) {
+        for (group, turned) in jobs.groups.iter().zip(&shown) {
             if let Some(focal) = TurnedCamera::agreed_focal(turned) {
                 let names: Vec<String> = group.iter().map(|&at| images[at].name.clone()).collect();
                 session.note(format!(
-                    "focal length of about {focal:.0} px by photos taken on one spot: {}",
+                    "focal length sought from {focal:.0} px on, as photos show it that seem to be taken on one spot: {}",
                     some_of(&names, "photos")
                 ));
                 for &at in group {

@@ -1,6 +1,6 @@
 //! Alignment of a component to measured positions.
 
-use nalgebra::{Matrix3, SMatrix, SVector, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, SMatrix, SVector, UnitQuaternion, Vector2, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -132,7 +132,7 @@ const UNTOLD: f64 = 1e-9;
 /// A street is often close to a line, and then noise in the measurements would decide the roll about it. So the mean
 /// up direction of the `upright` images (panorama rigs stand or hang level) fixes roll and pitch wherever the
 /// measurements that agree do not spread sideways by more than their own noise, or lack a height. `None` with fewer than
-/// 3 measured images, or 2 where an up direction is known.
+/// 3 measured images, or 2 where an up direction is known, and where those that agree are at one place as far as they tell.
 pub fn georegister(
     params: &GeoregisterParams,
     reconstruction: &Reconstruction,
@@ -161,7 +161,7 @@ pub fn georegister(
         let on_a_line = sideways_spread(&agreeing) < SPREAD_OF_NOISE * params.gps_sigma_m;
         if on_a_line { alignment.robust(2, seed, |pairs| fit_upright(&up, pairs)) } else { None }
     });
-    let best = level.or(free)?;
+    let best = level.or(free).filter(|best| alignment.is_fixed(best))?;
     let residuals = pairs
         .iter()
         .map(|pair| {
@@ -214,6 +214,22 @@ impl Alignment<'_> {
         (0..self.pairs.len()).filter(agrees).collect()
     }
 
+    /// Whether the measurements that agree tell a scale: they spread by more than they miss the centres by. Those of one place, or
+    /// rounded to it, fit with everything in a point.
+    fn is_fixed(&self, similarity: &Similarity) -> bool {
+        let agreeing: Vec<&Pair> = self.agreeing(similarity).into_iter().map(|at| &self.pairs[at]).collect();
+        let count = agreeing.len() as f64;
+        let placed: Vec<Vector2<f64>> =
+            agreeing.iter().map(|pair| similarity.transform_point(&pair.center).xy()).collect();
+        let middle = placed.iter().sum::<Vector2<f64>>() / count;
+        let root_mean = |sum: f64| (sum / count).sqrt();
+        let spread = root_mean(placed.iter().map(|place| (place - middle).norm_squared()).sum());
+        let missed = root_mean(agreeing.iter().map(|pair| pair.offset(similarity).xy().norm_squared()).sum());
+        agreeing.len() >= self.pairs.len().min(3)
+            && spread > missed
+            && spread > LEAST_SPREAD * self.params.gps_sigma_m
+    }
+
     /// The best of fits to samples of at least `least` pairs and to all, refined on what agrees.
     ///
     /// Three noisy neighbours leave the tilt of the whole free, so larger samples and the fit to all compete.
@@ -250,6 +266,8 @@ impl Alignment<'_> {
     }
 }
 
+/// Spread of a component in the measured frame, in standard deviations of one measurement, below which it is a point in it.
+const LEAST_SPREAD: f64 = 0.01;
 /// Sideways spread of the measurements, in standard deviations of one, below which they do not fix the tilt.
 const SPREAD_OF_NOISE: f64 = 5.0;
 
@@ -343,6 +361,27 @@ mod tests {
             measured.push(Some(at(truth.transform_point(&center) + noise)));
         }
         (reconstruction, measured, truth)
+    }
+
+    #[test]
+    fn positions_of_one_place_or_that_contradict_each_other_fix_nothing() {
+        let (reconstruction, right, _) = street(8);
+        let level = [true; 8];
+        let place = |measured: &[Option<MeasuredPosition>]| {
+            georegister(&GeoregisterParams::default(), &reconstruction, measured, &level, 0)
+        };
+        assert!(place(&right).is_some());
+        let same = vec![Some(at(Vector3::new(3.0, 4.0, 5.0))); 8];
+        assert!(place(&same).is_none());
+        // Rounded to a grid of 100 m.
+        let rounded = |position: &Option<MeasuredPosition>| {
+            position.map(|measured| at(measured.enu.map(|value| (value / 100.0).round() * 100.0)))
+        };
+        assert!(place(&right.iter().map(rounded).collect::<Vec<_>>()).is_none());
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let anywhere: Vec<_> =
+            (0..8).map(|_| Some(at(Vector3::from_fn(|_, _| rng.random_range(-5e4..5e4))))).collect();
+        assert!(place(&anywhere).is_none());
     }
 
     #[test]

@@ -13,7 +13,7 @@ use crate::{
 };
 
 /// Bumped when equal inputs and parameters give another geometry.
-pub const TWO_VIEW_VERSION: u32 = 5;
+pub const TWO_VIEW_VERSION: u32 = 6;
 
 /// How to verify a pair.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

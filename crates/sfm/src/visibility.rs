@@ -20,5 +20,28 @@ pub(crate) fn is_same_view(point: &Vector3<f64>, observer: &Vector3<f64>, candid
 
 /// Whether a direction of the camera's frame falls into its image.
 pub(crate) fn is_in_image(camera: &Camera, direction: &Vector3<f64>) -> bool {
-    camera.is_panoramic() || camera.project(direction).is_some_and(|pixel| camera.contains(&pixel))
+    camera.covers_the_sphere() || camera.project(direction).is_some_and(|pixel| camera.contains(&pixel))
+}
+
+#[cfg(test)]
+mod tests {
+    use setloc_features::CameraModel;
+
+    use super::*;
+
+    #[test]
+    fn what_a_crop_of_a_panorama_leaves_out_is_not_in_it() {
+        let whole = Camera::equirectangular(4000, 2000);
+        let crop = Camera {
+            model: CameraModel::Equirectangular,
+            width: 1000,
+            height: 600,
+            params: vec![4000.0, 2000.0, 1500.0, 700.0],
+        };
+        let behind = -Vector3::z();
+        for direction in [Vector3::z(), behind, Vector3::y()] {
+            assert!(is_in_image(&whole, &direction));
+            assert_eq!(is_in_image(&crop, &direction), direction == Vector3::z(), "{direction}");
+        }
+    }
 }

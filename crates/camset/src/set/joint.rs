@@ -296,7 +296,7 @@ impl Component<'_> {
         }
         let names: Vec<&str> = self.members.iter().map(|&photo| self.photos[photo].name).collect();
         let mut remarks = vec![format!("{}: {}", called(&names, self.scene.component), reasons.join("; "))];
-        remarks.extend(self.contradicted_cameras());
+        remarks.extend(self.contradicted_cameras(&joint.model));
         remarks.extend(stretch_remark(&joint.model.stretch));
         remarks.extend(self.lengths().map(|(slots, length)| self.basis(slots, &length)));
         let mut rigid_answers =
@@ -573,11 +573,13 @@ impl Component<'_> {
         log10_chance_of_more(found, by_chance as f64 + 1.0) <= MAX_LOG10_CHANCE
     }
 
-    /// The paper's T_OPT, with further rounds where the last one shows that photos are stretched.
+    /// The paper's T_OPT, with further rounds where the last one shows that photos are stretched or have another focal length.
     fn refine_jointly(&self, set_from_camera: &[Rigid], shared: Shared<'_>, rigid: &RigidPose) -> Joint {
         let first = self.rigid_model(set_from_camera, &rigid.world_from_set);
+        let known = |model: &JointModel| model.cameras.iter().filter(|camera| camera.is_known()).count();
+        let known_first = known(&first);
         let joint = self.refine_in_rounds(first, 0, shared, rigid);
-        if joint.model.stretch.is_free {
+        if joint.model.stretch.is_free || known(&joint.model) < known_first {
             // The last round has freed it where matches were already right; freed from the rigid pose on it bends to wrong ones.
             self.refine_in_rounds(joint.model, self.params.rounds.min(1), shared, rigid)
         } else {
@@ -727,13 +729,13 @@ impl Component<'_> {
         cameras.map(|(at, camera)| JointCamera { known: known(at, camera), camera: camera.clone() }).collect()
     }
 
-    /// What the local model shows of focal lengths that were told otherwise, in words.
-    fn contradicted_cameras(&self) -> Vec<String> {
-        let contradicted = |(at, camera): (usize, JointCamera)| {
-            let KnownOfCamera::AllButFocal(shown) = camera.known else { return None };
+    /// What the set shows of focal lengths that were told otherwise, in words.
+    fn contradicted_cameras(&self, model: &JointModel) -> Vec<String> {
+        let contradicted = |(at, camera): (usize, &JointCamera)| {
+            let KnownOfCamera::AllButFocal(_) = camera.known else { return None };
             let photos = (0..self.members.len()).filter(|&slot| self.camera_of(slot) == at);
             let photos: Vec<_> = photos.map(|slot| &self.photos[self.members[slot]]).collect();
-            let (told, shown) = (photos.first()?.camera.focal_length(), shown.focal_length());
+            let (told, shown) = (photos.first()?.camera.focal_length(), camera.camera.focal_length());
             let names: Vec<&str> = photos.iter().map(|photo| photo.name).collect();
             Some(format!(
                 "the focal length that is told for {} is {told:.1} px; together they show {shown:.1} px ({:+.1} %), which is used",
@@ -741,7 +743,7 @@ impl Component<'_> {
                 100.0 * (shown / told - 1.0)
             ))
         };
-        self.joint_cameras().into_iter().enumerate().filter_map(contradicted).collect()
+        model.cameras.iter().enumerate().filter_map(contradicted).collect()
     }
 }
 

@@ -102,7 +102,7 @@ pub(crate) fn rigid_pose(
     let lone = Sights::worth_of_lone(sights.agreeing_lone(&initial, bound).len());
     let support = rays.agreeing(&initial, bound, count).len() + sights.agreeing(&initial, bound).len() + lone;
     if params.other_hypotheses && support < params.verdict.min_inliers {
-        let mut most = params.verdict.min_inliers;
+        let mut most = params.verdict.min_inliers.saturating_sub(1);
         for (pose, score) in scored.into_iter().take(WEAK_POSES) {
             let shown = shown(&pose);
             if shown > most {

@@ -72,7 +72,7 @@ pub struct ProjectJacobian {
     pub pixel: Vector2<f64>,
     /// ∂pixel / ∂direction, 2 × 3, for the direction as given (not normalized).
     pub d_direction: Matrix2x3<f64>,
-    /// ∂pixel / ∂params, 2 × 8, columns in COLMAP's parameter order; unused columns are zero.
+    /// ∂pixel / ∂params, 2 × 13, columns in COLMAP's parameter order; unused columns are zero.
     pub d_params: SMatrix<f64, 2, MAX_CAMERA_PARAMS>,
 }
 
@@ -83,7 +83,7 @@ pub struct UnprojectJacobian {
     pub bearing: Vector3<f64>,
     /// ∂bearing / ∂pixel, 3 × 2; its columns are tangent to the sphere.
     pub d_pixel: Matrix3x2<f64>,
-    /// ∂bearing / ∂params, 3 × 8, columns in COLMAP's parameter order; unused columns are zero.
+    /// ∂bearing / ∂params, 3 × 13, columns in COLMAP's parameter order; unused columns are zero.
     pub d_params: SMatrix<f64, 3, MAX_CAMERA_PARAMS>,
 }
 
@@ -410,6 +410,11 @@ impl Camera {
     /// Whether the left and the right border of the image are neighbours on the sphere.
     pub fn wraps_around(&self) -> bool {
         self.full_turn_px() == Some(f64::from(self.width))
+    }
+
+    /// Whether every direction is in the image: a panorama that is no crop.
+    pub fn covers_the_sphere(&self) -> bool {
+        self.wraps_around() && self.half_turn_px() == Some((f64::from(self.height), 0.0))
     }
 
     /// Width in pixels of the whole turn of a panorama, of which the image may be a crop; `None` for photos.

@@ -68,7 +68,7 @@ pub fn guess_camera(info: &ImageInfo) -> (Camera, CameraSource) {
         return (photo(focal), CameraSource::ExifFocal35mm);
     }
     let by_sensor = metadata.focal_mm.zip(metadata.pixels_per_mm).and_then(|(focal, density)| {
-        let original = metadata.original_width.unwrap_or(longer);
+        let original = metadata.original_longer.unwrap_or(longer);
         (original / density < MAX_SENSOR_MM).then(|| focal * density * longer / original)
     });
     if let Some(focal) = by_sensor.filter(plausible) {

@@ -52,8 +52,8 @@ pub struct ImageMetadata {
     pub focal_mm: Option<f64>,
     /// Pixels per millimetre of the sensor along its width, for the original size.
     pub pixels_per_mm: Option<f64>,
-    /// Width in pixels of the original, which `pixels_per_mm` refers to.
-    pub original_width: Option<f64>,
+    /// Longer side in pixels of the original, which `pixels_per_mm` refers to.
+    pub original_longer: Option<f64>,
     /// Camera maker.
     pub make: Option<String>,
     /// Camera model.
@@ -71,7 +71,7 @@ impl Default for ImageMetadata {
             focal_35mm: None,
             focal_mm: None,
             pixels_per_mm: None,
-            original_width: None,
+            original_longer: None,
             make: None,
             model: None,
             gps: None,
@@ -107,7 +107,8 @@ impl ImageMetadata {
             _ => 25.4,
         };
         metadata.pixels_per_mm = positive(Tag::FocalPlaneXResolution).map(|value| value / unit_mm);
-        metadata.original_width = positive(Tag::PixelXDimension);
+        let sides = [Tag::PixelXDimension, Tag::PixelYDimension].map(positive);
+        metadata.original_longer = sides.into_iter().flatten().reduce(f64::max);
         metadata.make = text(&exif, Tag::Make);
         metadata.model = text(&exif, Tag::Model);
         metadata.gps = read_gps(&exif);

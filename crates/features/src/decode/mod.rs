@@ -146,7 +146,7 @@ pub fn probe(bytes: &[u8], limits: &DecodeLimits) -> Result<ImageInfo, FeatureEr
     let (width, height) = if format == ImageFormat::Jpeg {
         jpeg::size(bytes)?
     } else {
-        let decoder = reader(bytes, format).into_decoder().map_err(|error| damage(format, &error))?;
+        let decoder = reader(bytes, format, limits).into_decoder().map_err(|error| damage(format, &error))?;
         decoder.dimensions()
     };
     limits.check(width.into(), height.into())?;
@@ -166,10 +166,21 @@ fn format_of(bytes: &[u8]) -> Result<ImageFormat, FeatureError> {
     if supported.contains(&format) { Ok(format) } else { Err(FeatureError::UnknownFormat) }
 }
 
-fn reader(bytes: &[u8], format: ImageFormat) -> ImageReader<Cursor<&[u8]>> {
+/// Bytes a pixel, at most, of what decoders hold beside each other.
+const MOST_BYTES_A_PIXEL: u64 = 16;
+/// Most bytes of what a PNG has beside its pixels, as a colour profile, which is deflated: a megabyte of it may be a gigabyte.
+const MOST_BYTES_BESIDE: u64 = 64 << 20;
+
+fn reader<'b>(bytes: &'b [u8], format: ImageFormat, limits: &DecodeLimits) -> ImageReader<Cursor<&'b [u8]>> {
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     // Our own limits are checked on the decoder's size before it decodes.
-    reader.limits(Limits::no_limits());
+    let mut of_decoder = Limits::no_limits();
+    of_decoder.max_alloc = Some(match format {
+        // Pixels are decoded into a buffer of our own, a row at a time.
+        ImageFormat::Png => MOST_BYTES_BESIDE,
+        _ => MOST_BYTES_A_PIXEL.saturating_mul(limits.max_pixels),
+    });
+    reader.limits(of_decoder);
     reader
 }
 
@@ -178,7 +189,7 @@ fn decode_other(
     format: ImageFormat,
     limits: &DecodeLimits,
 ) -> Result<(u32, u32, Vec<u8>), FeatureError> {
-    let decoder = reader(bytes, format).into_decoder().map_err(|error| damage(format, &error))?;
+    let decoder = reader(bytes, format, limits).into_decoder().map_err(|error| damage(format, &error))?;
     let (width, height) = decoder.dimensions();
     limits.check(width.into(), height.into())?;
     let image = image::DynamicImage::from_decoder(decoder).map_err(|error| damage(format, &error))?;

@@ -134,6 +134,60 @@ fn what_is_no_image_is_said_so() {
     assert!(decode(&[0xFF, 0xD8, 0xFF, 0xE0], &limits()).is_err());
 }
 
+/// A chunk of a PNG.
+fn chunk(kind: [u8; 4], data: &[u8]) -> Vec<u8> {
+    let checked = [kind.as_slice(), data].concat();
+    let mut crc = u32::MAX;
+    for byte in &checked {
+        crc ^= u32::from(*byte);
+        for _ in 0..8 {
+            crc = (crc >> 1) ^ (0xEDB8_8320 * (crc & 1));
+        }
+    }
+    [&(data.len() as u32).to_be_bytes(), checked.as_slice(), &(!crc).to_be_bytes()].concat()
+}
+
+/// So many zeros by deflate's fixed codes: a zero, then copies of 258 bytes from one before. The checksum is left out, which
+/// no one gets to.
+fn deflated_zeros(count: usize) -> Vec<u8> {
+    let mut bits: Vec<bool> = vec![true, true, false];
+    let mut add = |code: u32, length: u32| (0..length).rev().for_each(|at| bits.push(code >> at & 1 == 1));
+    add(0b0011_0000, 8);
+    for _ in 0..count / 258 {
+        // The length 258, then the distance 1.
+        add(0b1100_0101, 8);
+        add(0, 5);
+    }
+    add(0, 7);
+    let byte = |bits: &[bool]| bits.iter().enumerate().map(|(at, bit)| u8::from(*bit) << at).sum::<u8>();
+    [&[0x78, 0x01], bits.chunks(8).map(byte).collect::<Vec<_>>().as_slice()].concat()
+}
+
+#[test]
+fn what_a_png_has_beside_its_pixels_is_not_inflated_without_bound() {
+    let png = encode(ImageFormat::Png, 60, 40);
+    let after_header = 8 + 25;
+    let with_profile = |zeros: usize| {
+        let profile = [b"profile\0\0".as_slice(), &deflated_zeros(zeros)].concat();
+        [&png[..after_header], &chunk(*b"iCCP", &profile), &png[after_header..]].concat()
+    };
+    // A profile of a gigabyte is passed over or an error, and never held.
+    let bytes = with_profile(1 << 30);
+    assert!(bytes.len() < 8 << 20);
+    assert!(
+        probe(&bytes, &limits()).is_ok_and(|info| info.width == 60) || decode(&bytes, &limits()).is_err()
+    );
+    let peak = peak_resident_bytes();
+    assert!(peak < 900 << 20, "{peak} bytes");
+}
+
+/// Most memory that this process has held; 0 where the system does not say.
+fn peak_resident_bytes() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find(|line| line.starts_with("VmHWM")).unwrap_or_default();
+    line.split_whitespace().nth(1).and_then(|kilobytes| kilobytes.parse::<u64>().ok()).unwrap_or(0) << 10
+}
+
 #[test]
 fn sizes_are_checked_before_pixels_are_allocated() {
     let mut bmp = encode(ImageFormat::Bmp, 8, 8);
@@ -306,7 +360,7 @@ fn an_undescribed_image_gets_a_stated_guess() {
     let sensor = ImageMetadata {
         focal_mm: Some(50.0),
         pixels_per_mm: Some(160.0),
-        original_width: Some(6000.0),
+        original_longer: Some(6000.0),
         ..nothing()
     };
     let (camera, source) = guess(3000, 2000, sensor);

@@ -8,16 +8,23 @@ pub const AUC_THRESHOLDS_DEG: [f64; 5] = [0.1, 0.5, 1.0, 5.0, 10.0];
 /// Area under the recall curve of relative pose errors up to each threshold, in percent.
 ///
 /// Over all pairs of the true images the larger of the relative rotation error and the angle between the relative
-/// translation directions; pairs with an unregistered image count as failed. Needs no alignment.
+/// translation directions; pairs with an unregistered image count as failed. Needs no alignment. Of a pair at one place, which has no
+/// direction, the rotation alone counts.
 pub fn auc_percent(estimated: &BTreeMap<String, Rigid>, truth: &BTreeMap<String, Rigid>) -> [f64; 5] {
     let names: Vec<&String> = truth.keys().collect();
+    let apart = |a: &Rigid, b: &Rigid| (a.translation - b.translation).norm();
+    let extent = truth.values().flat_map(|a| truth.values().map(move |b| apart(a, b))).fold(0.0, f64::max);
     let mut errors = Vec::new();
     for (at, first) in names.iter().enumerate() {
         for second in &names[at + 1..] {
             let pair = estimated.get(*first).zip(estimated.get(*second));
-            errors.push(
-                pair.map_or(f64::INFINITY, |(a, b)| pair_error_deg(a, b, &truth[*first], &truth[*second])),
-            );
+            errors.push(pair.map_or(f64::INFINITY, |(a, b)| {
+                let (true_a, true_b) = (&truth[*first], &truth[*second]);
+                let rotation = rotation_error(a, b, true_a, true_b);
+                let have_direction = apart(true_a, true_b) > ONE_PLACE * extent;
+                let direction = if have_direction { direction_error(a, b, true_a, true_b) } else { 0.0 };
+                rotation.max(direction).to_degrees()
+            }));
         }
     }
     errors.sort_by(f64::total_cmp);
@@ -38,14 +45,20 @@ fn area(errors: &[f64], threshold: f64) -> f64 {
     100.0 * (sum + (threshold - x) * y) / threshold
 }
 
-fn pair_error_deg(a: &Rigid, b: &Rigid, true_a: &Rigid, true_b: &Rigid) -> f64 {
+/// Share of the true extent up to which two images are at one place.
+const ONE_PLACE: f64 = 1e-6;
+
+/// Angle between the relative rotations.
+fn rotation_error(a: &Rigid, b: &Rigid, true_a: &Rigid, true_b: &Rigid) -> f64 {
     let relative = |a: &Rigid, b: &Rigid| b.rotation.inverse() * a.rotation;
-    let rotation = (relative(a, b).inverse() * relative(true_a, true_b)).angle();
+    (relative(a, b).inverse() * relative(true_a, true_b)).angle()
+}
+
+/// Angle between the directions from the first camera to the second, in the first one's frame.
+fn direction_error(a: &Rigid, b: &Rigid, true_a: &Rigid, true_b: &Rigid) -> f64 {
     let direction = |a: &Rigid, b: &Rigid| a.rotation.inverse() * (b.translation - a.translation);
     let (u, v) = (direction(a, b), direction(true_a, true_b));
-    let translation =
-        if u.norm() * v.norm() > 0.0 { u.cross(&v).norm().atan2(u.dot(&v)) } else { std::f64::consts::PI };
-    rotation.max(translation).to_degrees()
+    if u.norm() > 0.0 { u.cross(&v).norm().atan2(u.dot(&v)) } else { std::f64::consts::PI }
 }
 
 #[cfg(test)]
@@ -79,6 +92,26 @@ mod tests {
         let mut estimated = poses();
         estimated.remove("0");
         assert!((auc_percent(&estimated, &poses())[4] - 50.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn two_views_of_one_place_are_judged_by_their_rotation() {
+        let turned = |poses: BTreeMap<String, Rigid>, angle: f64| {
+            let view = |(name, pose): (String, Rigid)| {
+                let turn = UnitQuaternion::from_euler_angles(0.0, angle, 0.0);
+                [(name.clone(), pose), (name + "b", Rigid::new(pose.rotation * turn, pose.translation))]
+            };
+            poses.into_iter().flat_map(view).collect::<BTreeMap<_, _>>()
+        };
+        let truth = turned(poses(), 0.5);
+        assert!(auc_percent(&truth, &truth).iter().all(|area| *area > 99.999));
+        // Of 28 pairs only those four whose views have other angles between them, and the 12 of one such and one other view.
+        let off = auc_percent(&turned(poses(), 0.6), &truth)[3];
+        assert!(off < 60.0, "{off}");
+        // Two places that are one in the estimate have no direction, and fail.
+        let mut joined = truth.clone();
+        joined.insert("1".to_owned(), truth["0"]);
+        assert!(auc_percent(&joined, &truth)[4] < 90.0);
     }
 
     #[test]

@@ -53,7 +53,8 @@ pub struct Comparison {
 impl Comparison {
     /// Compares poses with the truth.
     ///
-    /// An image has the true name that is its own, or the only one that ends in it or that it ends in, in whole folders and files.
+    /// An image has the true name that is its own, or the only one that ends in it or that it ends in, in whole folders and files, or
+    /// that has the same file in the same folder.
     pub fn of(
         name: &str,
         poses: &BTreeMap<String, Rigid>,
@@ -123,7 +124,11 @@ fn by_true_names(
             return Some(name.clone());
         }
         let alike = of_file.get(&file(name)).into_iter().flatten();
-        let mut alike = alike.filter(|other| ends_in(other, name) || ends_in(name, other));
+        let mut alike = alike.filter(|other| {
+            ends_in(other, name)
+                || ends_in(name, other)
+                || in_folder(name).is_some_and(|at| ends_in(other, at))
+        });
         alike.next().filter(|_| alike.next().is_none()).map(|name| (*name).clone())
     };
     let mut named: BTreeMap<String, Rigid> = BTreeMap::new();
@@ -136,6 +141,12 @@ fn by_true_names(
     named.retain(|name, _| !twice.contains(name));
     let unknown = poses.len() - named.len();
     (named, unknown)
+}
+
+/// The name with its last folder only; `None` without any.
+fn in_folder(name: &str) -> Option<&str> {
+    let (folder, _) = name.rsplit_once('/')?;
+    Some(&name[folder.rfind('/').map_or(0, |at| at + 1)..])
 }
 
 /// A table of several programs' figures in Markdown.
@@ -239,6 +250,7 @@ mod tests {
             known(&["3.jpg", "x/queries/a/1.jpg"]),
             (vec!["panoramas/3.jpg".to_owned(), "queries/a/1.jpg".to_owned()], 0)
         );
+        assert_eq!(known(&["grown-1/a/1.jpg", "b/1.jpg"]), (vec!["queries/a/1.jpg".to_owned()], 1));
         // Two images end in the first, none in the second, and two names are of one.
         assert_eq!(known(&["0.jpg", "13.jpg", "3.jpg", "panoramas/3.jpg"]), (vec![], 4));
     }

@@ -10,6 +10,7 @@ use super::Answer;
 use super::args::{BenchArgs, RunArgs};
 use super::build::{scene_markers, warn_skipped, write_json};
 use super::demo::render_town;
+use super::outputs::refuse_image_folder;
 use crate::bench::{
     Availability, Baseline, BenchGps, BenchOptions, DatasetEntry, DatasetFigures, Harness, HarnessRun,
     ParameterSet, Registry, about, bench_dataset, errors_csv, figures_section, html_report, markdown_tables,
@@ -26,7 +27,9 @@ pub fn run(args: &BenchArgs) -> Result<Answer> {
     if args.datasets.is_empty() {
         return run_registry(args);
     }
+    refuse_same_names(&args.datasets)?;
     for root in &args.datasets {
+        refuse_images_of(root, &args.output)?;
         let root = root.canonicalize().with_context(|| format!("cannot open {}", root.display()))?;
         let output = match args.datasets.len() {
             1 => args.output.clone(),
@@ -47,6 +50,31 @@ pub fn run(args: &BenchArgs) -> Result<Answer> {
         print::note(&format!("wrote {}/", output.display()));
     }
     Ok(Answer::Done)
+}
+
+/// Refuses results among a data set's images.
+fn refuse_images_of(root: &Path, output: &Path) -> Result<()> {
+    let queries = root.join("queries");
+    let sets = std::fs::read_dir(&queries).into_iter().flatten().flatten().map(|entry| entry.path());
+    let folders: Vec<PathBuf> =
+        [root.join("panoramas"), root.join("images")].into_iter().chain(sets).collect();
+    refuse_image_folder(&folders, output, "name another folder for the results with -o")
+}
+
+/// Refuses data sets whose results would replace each other's.
+fn refuse_same_names(datasets: &[PathBuf]) -> Result<()> {
+    let mut names = BTreeSet::new();
+    for root in datasets {
+        let name = root.canonicalize().unwrap_or_else(|_| root.clone());
+        let name = name.file_name().unwrap_or_default().to_owned();
+        if !names.insert(name.clone()) {
+            return Err(Hinted::error(
+                format!("two data sets are called {}, and so would be their results", name.display()),
+                "run each by itself, with an output folder of its own (-o)",
+            ));
+        }
+    }
+    Ok(())
 }
 
 /// Runs over all that is registered and compares with the baseline.

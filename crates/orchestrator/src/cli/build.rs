@@ -12,8 +12,8 @@ use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
 use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
 use crate::building::{
-    BuildOutcome, Built, Pass, SceneSource, alike_pairs, build_scene, by_passes, estimate_cameras,
-    has_guessed_cameras, left_apart,
+    BuildOutcome, Built, Pass, SceneSource, alike_pairs, asks_turns, build_scene, by_passes,
+    has_guessed_cameras, left_apart, tell_cameras,
 };
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, unread_images};
@@ -27,6 +27,7 @@ use crate::print;
 use crate::scene::SceneFile;
 use crate::session::{Session, cache_folder};
 use crate::store::{RunRecord, Store, remove_files, write_atomically};
+use crate::turning::{TurnedJobs, guess_by_turns};
 
 /// Blue, for cameras of the scene.
 pub const SCENE_COLOR: [u8; 3] = [30, 90, 220];
@@ -54,6 +55,8 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     // The report is written last: exports of another scene, as a killed run leaves them, are none of this one.
     let present = present.filter(|hash| reported_scene(&export) == Some(*hash));
     let write = |built: &Built| {
+        // Until it is written again nothing says whose these exports are.
+        remove_files(&export, &[REPORT])?;
         let models = || write_models(&export, &built.scene, &built.features);
         let (scene, models) = rayon::join(|| write_atomically(output, &built.file), models);
         scene.and(models)
@@ -171,17 +174,11 @@ fn next_jobs<'g>(
     (store, name): (&Store, &str),
 ) -> Result<JobGraph<'g>> {
     let session = || args.source.run.session(&args.source.output, None);
-    let mut told = None;
-    if has_guessed_cameras(inputs.images) {
-        let mut graph = JobGraph::default();
-        add_first_model(&mut graph, inputs)?;
-        if !is_stored(&graph, store) {
-            print::note("cameras are estimated by a first model, and what follows from them is not listed");
-            return Ok(graph);
-        }
-        told = estimate_cameras(&session()?, name, inputs)?.0;
-    }
-    let images = told.as_deref().unwrap_or(inputs.images);
+    let images = match planned_cameras(args, inputs, (store, name))? {
+        Planned::Known(images) => images,
+        Planned::Jobs(graph) => return Ok(graph),
+    };
+    let images = &images[..];
     let untold = |_| ();
     by_passes(inputs.config, images, untold, |images, stays| {
         let inputs = SceneInputs { images, ..inputs };
@@ -198,6 +195,55 @@ fn next_jobs<'g>(
         add_scene(&mut graph, inputs)?;
         Ok(Pass::Stays(graph))
     })
+}
+
+/// What a plan needs and can have without running anything, or the jobs that are to be run for it.
+enum Planned<'g, T> {
+    Known(T),
+    Jobs(JobGraph<'g>),
+}
+
+/// The images with their cameras, as [`estimate_cameras`](crate::building::estimate_cameras) tells those that are guessed.
+fn planned_cameras<'g>(
+    args: &PlanArgs,
+    inputs: SceneInputs<'_>,
+    (store, name): (&Store, &str),
+) -> Result<Planned<'g, Vec<SourceImage>>> {
+    let session = || args.source.run.session(&args.source.output, None);
+    let SceneInputs { alike, config, seed, .. } = inputs;
+    let mut images = inputs.images.to_vec();
+    if !has_guessed_cameras(&images) {
+        return Ok(Planned::Known(images));
+    }
+    let params = (&config.features, config);
+    if asks_turns(&images)
+        && let Some(jobs) = TurnedJobs::of(&images, alike, params, seed)
+    {
+        if !is_stored(&jobs.graph, store) {
+            print::note(
+                "focal lengths are sought by photos of one spot, and what follows from them is not listed",
+            );
+            return Ok(Planned::Jobs(jobs.graph));
+        }
+        guess_by_turns(&session()?, name, &mut images, alike, params, seed)?;
+    }
+    // A second model only where the first leaves doubt.
+    for _ in 0..2 {
+        let inputs = SceneInputs { images: &images, ..inputs };
+        let mut graph = JobGraph::default();
+        add_first_model(&mut graph, inputs)?;
+        if !is_stored(&graph, store) {
+            print::note("cameras are estimated by a first model, and what follows from them is not listed");
+            return Ok(Planned::Jobs(graph));
+        }
+        let first = tell_cameras(&session()?, name, inputs)?;
+        let Some(told) = first.told else { break };
+        images = told;
+        if !first.is_doubtful {
+            break;
+        }
+    }
+    Ok(Planned::Known(images))
 }
 
 /// Neither the scene nor what is exported may replace what the scene is made from.

@@ -1,4 +1,4 @@
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use serde_json::json;
@@ -6,6 +6,7 @@ use serde_json::json;
 use super::Answer;
 use super::args::CompareArgs;
 use super::build::write_json;
+use super::outputs::{refuse_folder, refuse_input};
 use crate::bench::{Comparison, Frame, comparison_table};
 use crate::error::Hinted;
 use crate::import::read_poses;
@@ -13,12 +14,30 @@ use crate::print;
 
 /// `setloc compare`
 pub fn run(args: &CompareArgs) -> Result<Answer> {
+    if let Some(output) = &args.output {
+        refuse_folder("-o", output, "comparison.json")?;
+        refuse_input(args.poses.iter().chain([&args.truth]).map(PathBuf::as_path), output)?;
+    }
     let truth = read_poses(&args.truth)?;
     let frame = match &args.align_by {
         Some(prefix) => Frame::AlignedBy(prefix.clone()),
         None if args.no_align => Frame::Same,
         None => Frame::Aligned,
     };
+    if let Some(prefix) = &args.align_by {
+        let aligning = truth.keys().filter(|name| name.starts_with(prefix.as_str())).count();
+        if aligning == 0 || aligning == truth.len() {
+            let message = format!(
+                "{aligning} of {} true names begin with `{prefix}`, and the others are to be judged by them",
+                truth.len()
+            );
+            let first = truth.keys().next().map_or_else(String::new, |name| format!(", as `{name}`"));
+            return Err(Hinted::error(
+                message,
+                format!("--align-by names the beginning of some names{first}"),
+            ));
+        }
+    }
     let mut comparisons = Vec::new();
     for path in &args.poses {
         let poses = read_poses(path)?;
@@ -53,6 +72,9 @@ fn warn(path: &Path, found: &Comparison) {
             "warning: {path}: the truth tells nothing of {} images, or of two names one",
             found.unknown
         ));
+    }
+    if found.registered == 0 {
+        print::note(&format!("warning: {path}: none of its poses is of an image that is judged"));
     }
     if found.scale.is_none() {
         print::note(&format!("warning: {path}: too few images to align by, so nothing is told of errors"));

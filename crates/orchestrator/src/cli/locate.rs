@@ -82,7 +82,10 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     let answer = answers.iter().find(|(_, photo)| photo.name == target);
     let verdict = answer.map_or(Verdict::NotLocalized, |(_, photo)| photo.verdict);
     let found = verdict == Verdict::Localized;
-    print::note(&format!("target {target}: {}", verdict.in_words()));
+    let unread = located.skipped.iter().find(|skipped| skipped.name == target);
+    let why =
+        unread.map_or_else(String::new, |skipped| format!(", as it cannot be used: {}", skipped.reason));
+    print::note(&format!("target {target}: {}{why}", verdict.in_words()));
     let grown = match &args.grow {
         Some(output) => write_grown((output, &book), &session, &photos, &what, (&target, &located))?,
         None => true,
@@ -97,7 +100,7 @@ fn with_told_alone(given: &[SourceImage], photos: &[SourceImage], located: &Loca
     let told = |given: &SourceImage| {
         let (method, photo) = answers.iter().find(|(_, photo)| photo.name == given.name)?;
         let is_told = *method == "single"
-            && photo.verdict != Verdict::NotLocalized
+            && photo.verdict == Verdict::Localized
             && given.calibration == Calibration::Guessed
             && photo.camera != given.camera;
         is_told.then(|| photo.camera.clone())
@@ -114,7 +117,9 @@ fn with_told_alone(given: &[SourceImage], photos: &[SourceImage], located: &Loca
 
 /// Results may replace nothing that is read, but for the scene, which may grow in place.
 fn refuse_inputs(args: &LocateArgs, files: &[(String, PathBuf)]) -> Result<()> {
-    refuse_image_folder(&args.photos, &args.output, "name another folder for the results with -o")?;
+    let hint = "name another folder for the results with -o";
+    refuse_image_folder(&args.photos, &args.output, hint)?;
+    refuse_same_folder(&export_folder(&args.scene), &args.output, hint)?;
     let Some(grown) = &args.grow else { return Ok(()) };
     refuse_folder("--grow", grown, "grown.setloc")?;
     let hint = "name the scene that has grown otherwise: its exports are in the folder of its name";
@@ -267,7 +272,10 @@ fn write_results(
         markers.push(Marker { world_from_camera, color, directed: true });
         let camera = CameraId(merged.cameras.len() as u32);
         merged.cameras.push(photo.camera.clone());
-        let name = photo.name.clone();
+        // COLMAP knows images by their names.
+        let is_taken = |name: &String| merged.images.iter().any(|image| image.name == *name);
+        let mut free = std::iter::successors(Some(photo.name.clone()), |name| Some(format!("photos/{name}")));
+        let name = free.find(|name| !is_taken(name)).unwrap_or_default();
         merged.images.push(ReconstructionImage { name, camera, world_from_camera: Some(world_from_camera) });
     }
     let centres: Vec<_> =

@@ -64,6 +64,11 @@ impl Columns {
     }
 }
 
+/// A field without the quotes that some programs put about texts.
+fn unquoted(field: &str) -> &str {
+    field.strip_prefix('"').and_then(|field| field.strip_suffix('"')).unwrap_or(field)
+}
+
 impl GeoBook {
     /// Reads a `geo.csv`: one image a line, `name,lat,lon,alt`; `alt` may be missing. A first line of these names, in
     /// any order, tells the columns.
@@ -78,7 +83,7 @@ impl GeoBook {
         let mut columns = None;
         let mut by_image = BTreeMap::new();
         for (at, line) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
-            let fields: Vec<&str> = line.split(',').map(str::trim).collect();
+            let fields: Vec<&str> = line.split(',').map(|field| unquoted(field.trim())).collect();
             let wrong = |what: &str| {
                 let message = format!("{shown}, line {}: {what}", at + 1);
                 Hinted::error(message, "each line is name,lat,lon,alt in WGS84 degrees and metres")

@@ -191,7 +191,8 @@ fn number_alike(names: &mut [String]) {
 
 fn parts_of(path: &Path) -> Vec<String> {
     let normal = |part| match part {
-        Component::Normal(text) => Some(text.to_string_lossy().into_owned()),
+        // Names go into tables and lists of lines.
+        Component::Normal(text) => Some(text.to_string_lossy().replace(char::is_control, "_")),
         _ => None,
     };
     path.components().filter_map(normal).collect()

@@ -29,6 +29,9 @@ pub struct RunOptions<'a> {
     pub memory: u64,
     /// Set from outside to stop.
     pub stop: &'a AtomicBool,
+    /// The name under which what is done is noted from time to time, so that garbage collection leaves it to a run that goes on or
+    /// was killed; none where nothing is.
+    pub noted_as: Option<&'a str>,
 }
 
 /// What became of a job.
@@ -128,6 +131,9 @@ struct Shared {
 /// the price of one.
 const KEEPERS: usize = 4;
 
+/// How often what is done is noted.
+const NOTING: Duration = Duration::from_mins(1);
+
 /// What may wait to be kept: what a kill may cost, against a file of records for each result.
 const KEEPING: Limits =
     Limits { time: Duration::from_millis(250), enough_bytes: 4 << 20, most_bytes: 32 << 20 };
@@ -156,6 +162,8 @@ pub struct Executor<'a> {
     options: &'a RunOptions<'a>,
     shared: Mutex<Shared>,
     begun: Instant,
+    /// When what is done was noted last.
+    noted: Mutex<Instant>,
     /// Jobs running now, and jobs started ever: to know whether a job ran alone.
     running: AtomicUsize,
     started: AtomicUsize,
@@ -186,6 +194,7 @@ impl<'a> Executor<'a> {
             options,
             shared: Mutex::new(shared),
             begun: Instant::now(),
+            noted: Mutex::new(Instant::now()),
             running: AtomicUsize::new(0),
             started: AtomicUsize::new(0),
         }
@@ -339,9 +348,13 @@ impl<'a> Executor<'a> {
             return (State::Hit, Some(key), Some(record.output));
         }
         match self.execute(id, fingerprint) {
-            Ok(made) => {
+            Ok((made, is_kept)) => {
                 let (output, bytes) = (made.output, made.file.len());
-                unkept.add(made, bytes);
+                if is_kept {
+                    unkept.add(made, bytes);
+                } else {
+                    self.finished(&made);
+                }
                 (State::Ran, Some(key), Some(output))
             }
             Err(error) => (self.failed(id, &error), Some(key), None),
@@ -399,7 +412,19 @@ impl<'a> Executor<'a> {
         for made in made {
             self.finished(made);
         }
+        self.note_what_is_done();
         Ok(())
+    }
+
+    /// Notes from time to time what is done.
+    fn note_what_is_done(&self) {
+        // One thread that keeps results is enough.
+        let (Some(name), Ok(mut noted)) = (self.options.noted_as, self.noted.try_lock()) else { return };
+        if noted.elapsed() >= NOTING {
+            // What cannot be noted is none of the results.
+            let _ = self.options.store.note_unfinished(name, self.result().keys);
+            *noted = Instant::now();
+        }
     }
 
     /// Says that a job's result is kept.
@@ -427,8 +452,8 @@ impl<'a> Executor<'a> {
         Fingerprint { kind: job.kind.to_owned(), version: job.version, params: job.params.clone(), inputs }
     }
 
-    /// Runs the job's work.
-    fn execute(&self, id: JobId, fingerprint: Fingerprint) -> Result<Unkept> {
+    /// Runs the job's work; whether its result is to be kept.
+    fn execute(&self, id: JobId, fingerprint: Fingerprint) -> Result<(Unkept, bool)> {
         let job = self.graph.job(id);
         self.options.observer.notice(&Event::Started { kind: job.kind, job: job.name.clone() });
         let alone = self.running.fetch_add(1, Ordering::SeqCst) == 0;
@@ -444,7 +469,7 @@ impl<'a> Executor<'a> {
             if alone { clock::process_cpu_secs() - process } else { clock::thread_cpu_secs() - thread };
         let wall_secs = wall.elapsed().as_secs_f64();
         self.running.fetch_sub(1, Ordering::SeqCst);
-        let Product { value, file } = product?;
+        let Product { value, file, is_kept } = product?;
         let (output, file) = (ContentHash::of(&file), Arc::new(file));
         let slot = &mut self.lock().slots[id.index()];
         if slot.users_left > 0 {
@@ -453,7 +478,7 @@ impl<'a> Executor<'a> {
         if self.graph.wants_file(id) {
             slot.file = Some(Arc::clone(&file));
         }
-        Ok(Unkept { id, fingerprint, output, file, started_secs, wall_secs, cpu_secs })
+        Ok((Unkept { id, fingerprint, output, file, started_secs, wall_secs, cpu_secs }, is_kept))
     }
 
     /// Hash of a job's result, `None` when it has none.
@@ -578,7 +603,8 @@ mod tests {
 
     fn run(graph: &JobGraph<'_>, store: &Store, stop: &AtomicBool) -> Result<RunResult> {
         let observer = Broadcast::default();
-        let options = RunOptions { store, observer: &observer, threads: 4, memory: 100, stop };
+        let options =
+            RunOptions { store, observer: &observer, threads: 4, memory: 100, stop, noted_as: None };
         let pool = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
         pool.install(|| Executor::new(graph, &options).run())
     }

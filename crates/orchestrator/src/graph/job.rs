@@ -22,6 +22,7 @@ pub type JobId = NodeIndex;
 pub struct Product {
     pub(super) value: Arc<dyn Any + Send + Sync>,
     pub(super) file: Vec<u8>,
+    pub(super) is_kept: bool,
 }
 
 impl Product {
@@ -31,7 +32,14 @@ impl Product {
     /// When it cannot be encoded.
     pub fn new<T: Artifact>(value: T) -> Result<Self> {
         let file = codec::encode(&value)?;
-        Ok(Self { value: Arc::new(value), file })
+        Ok(Self { value: Arc::new(value), file, is_kept: true })
+    }
+
+    /// A result that depends on more than the job's inputs, as on a file that could not be read: it is not kept for another
+    /// run.
+    #[must_use]
+    pub fn for_this_run_only(self) -> Self {
+        Self { is_kept: false, ..self }
     }
 }
 

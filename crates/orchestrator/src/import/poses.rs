@@ -68,7 +68,9 @@ fn of_lines(path: &Path, text: &str) -> Result<BTreeMap<String, Rigid>> {
             (name, *number) = parted.context("a line has a name and 7 numbers").with_context(place)?;
             name = name.trim_end();
         }
-        poses.insert(name.to_owned(), world_from_camera(&numbers).with_context(place)?);
+        let is_new =
+            poses.insert(name.to_owned(), world_from_camera(&numbers).with_context(place)?).is_none();
+        anyhow::ensure!(is_new, "{}: {name} has a pose in an earlier line", place());
     }
     Ok(poses)
 }
@@ -200,6 +202,8 @@ mod tests {
         assert!(error("a.txt", "a 1 0 0 0 1 2\n").contains("a.txt, line 1: a line has a name and 7 numbers"));
         assert!(error("a.txt", "a 1 0 0 0 1 2 x\n").contains("`x` is no number"));
         assert!(error("a.txt", "a 0 0 0 0 1 2 3\n").contains("the rotation is zero"));
+        let twice = error("a.txt", "a 1 0 0 0 1 2 3\na 1 0 0 0 1 2 4\n");
+        assert!(twice.contains("line 2: a has a pose in an earlier line"), "{twice}");
         assert!(error("a.txt", "\n").contains("has no pose"));
         assert!(error("a.json", "[1]").contains("a.json: neither images by name"));
         assert!(error("a.json", "{").contains("is no JSON"));

@@ -47,7 +47,7 @@ impl Accuracy {
     }
 
     /// The medians, and the image that is known least.
-    pub fn note(&self, names: &[String], unit: &str) -> Option<String> {
+    pub fn note(&self, model: &Reconstruction, unit: &str) -> Option<String> {
         let mut known: Vec<&Known> = self.images.iter().filter(|known| known.share < UNKNOWN).collect();
         known.sort_by(|a, b| a.sigma.rotation_rad.total_cmp(&b.sigma.rotation_rad));
         let degrees = known.get(known.len() / 2)?.sigma.rotation_rad.to_degrees();
@@ -57,18 +57,18 @@ impl Accuracy {
             "relative to each other poses are known to {}{unit} and {degrees:.3}° (one sigma, medians; {} to {}{unit}), \
              unless the model is folded",
             significant(median.sigma.center),
-            names[most.image.index()],
+            model.images[most.image.index()].name,
             significant(most.sigma.center)
         ))
     }
 
     /// The images whose places are hardly held, or by what contradicts itself.
-    pub fn warning(&self, names: &[String]) -> Option<String> {
+    pub fn warning(&self, model: &Reconstruction) -> Option<String> {
         // What is no number is not known either.
         let mut weak: Vec<&Known> = self.images.iter().filter(|known| !(known.share <= WEAK)).collect();
         weak.sort_by(|a, b| b.share.total_cmp(&a.share));
         let named = weak.iter().map(|known| {
-            let name = &names[known.image.index()];
+            let name = &model.images[known.image.index()].name;
             if known.share < UNKNOWN {
                 format!("{name} (± {:.0} %)", 100.0 * known.share)
             } else {
@@ -99,11 +99,11 @@ mod tests {
     use super::*;
 
     /// Three images a unit apart, of which draws move the last by `off` and the others by a thousandth.
-    fn accuracy(off: f64) -> Accuracy {
+    fn accuracy(off: f64) -> (Reconstruction, Accuracy) {
         let pose =
             |at: usize, by: f64| Rigid::new(UnitQuaternion::identity(), Vector3::new(at as f64, by, 0.0));
         let image = |at: usize| ReconstructionImage {
-            name: format!("{at}"),
+            name: ["a", "b", "c"][at].to_owned(),
             camera: CameraId(0),
             world_from_camera: Some(pose(at, 0.0)),
         };
@@ -113,20 +113,27 @@ mod tests {
         };
         let errors =
             ModelErrors::new(0.0, (0..16).map(|at| draw(if at % 2 == 0 { 1.0 } else { -1.0 })).collect());
-        Accuracy::of_model(&model, &errors).unwrap()
+        let accuracy = Accuracy::of_model(&model, &errors).unwrap();
+        (model, accuracy)
     }
 
     #[test]
     fn what_is_hardly_held_is_named() {
-        let names = ["a", "b", "c"].map(str::to_owned);
-        let right = accuracy(0.002);
-        assert_eq!(right.warning(&names), None);
-        assert!(right.note(&names, " m").unwrap().contains("known to 0.0012 m and 0.000°"));
-        assert!(right.note(&names, " m").unwrap().contains("c to 0.0023 m"));
-        assert!(accuracy(0.05).warning(&names).unwrap().ends_with(": c (± 6 %)"));
+        let warning = |off| {
+            let (model, accuracy) = accuracy(off);
+            accuracy.warning(&model)
+        };
+        let note = |off, unit| {
+            let (model, accuracy) = accuracy(off);
+            accuracy.note(&model, unit).unwrap()
+        };
+        assert_eq!(warning(0.002), None);
+        assert!(note(0.002, " m").contains("known to 0.0012 m and 0.000°"));
+        assert!(note(0.002, " m").contains("c to 0.0023 m"));
+        assert!(warning(0.05).unwrap().ends_with(": c (± 6 %)"));
         for nowhere in [1e9, f64::INFINITY, f64::NAN] {
-            assert!(accuracy(nowhere).warning(&names).unwrap().ends_with(": c (not at all)"), "{nowhere}");
-            assert!(accuracy(nowhere).note(&names, "").unwrap().contains("b to 0.0012"), "{nowhere}");
+            assert!(warning(nowhere).unwrap().ends_with(": c (not at all)"), "{nowhere}");
+            assert!(note(nowhere, "").contains("b to 0.0012"), "{nowhere}");
         }
     }
 

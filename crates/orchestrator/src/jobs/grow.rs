@@ -70,7 +70,7 @@ pub fn add_grown(
     let (owned, scene) = (photos.to_vec(), Arc::clone(&what.scene));
     let grown = graph.add(Job {
         kind: "grown",
-        version: stages::SCENE_VERSION,
+        version: stages::GROWN_VERSION,
         name: name.to_owned(),
         params,
         external: BTreeMap::from([("scene".to_owned(), whole)]),
@@ -170,7 +170,8 @@ fn grown_scene(
     let mut components = scene.components.clone();
     components.iter_mut().skip(1).for_each(|model| growth.list_in(model, &names));
     let of_index = ContentHash::of(&serde_json::to_vec(index_params)?);
-    let mut content = vec![scene.content, inputs.hash("growth")?, of_index];
+    let made_by = ContentHash::of(&stages::GROWN_VERSION.to_le_bytes());
+    let mut content = vec![scene.content, inputs.hash("growth")?, of_index, made_by];
     let mut blocks = scene.features.clone();
     blocks.resize_with(components[0].images.len(), Block::default);
     for (photo, features) in growth.photos.iter().zip(&features) {

@@ -142,8 +142,12 @@ fn run_set(inputs: &Inputs<'_, '_>, photos: &[SourceImage], what: &LocateJobs) -
     let params = &what.config.camset;
     let mut located: SetLocalization =
         locate_set_anywhere(params, &components, &queries, &alone, models, views, seed)?;
-    located.advice.extend(at_hand.failures());
-    Product::new(located)
+    let failures = at_hand.failures();
+    let is_whole = failures.is_empty();
+    located.advice.extend(failures);
+    let product = Product::new(located)?;
+    // What an image was is in the job's key, not what it is now.
+    Ok(if is_whole { product } else { product.for_this_run_only() })
 }
 
 /// Adds the localization of each photo alone, from its features.

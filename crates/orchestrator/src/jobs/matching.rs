@@ -249,8 +249,14 @@ mod tests {
         let probe = graph.add(job);
         graph.require(probe, "matches", pair.matches);
         let (observer, stop) = (Broadcast::default(), AtomicBool::new(false));
-        let options =
-            RunOptions { store: &store, observer: &observer, threads: 2, memory: 1 << 30, stop: &stop };
+        let options = RunOptions {
+            store: &store,
+            observer: &observer,
+            threads: 2,
+            memory: 1 << 30,
+            stop: &stop,
+            noted_as: None,
+        };
         let result = Executor::new(&graph, &options).run().unwrap();
         assert_eq!(result.failed, BTreeMap::new());
         drop(graph);

@@ -25,11 +25,12 @@ pub(super) fn stretch_note((component, model): (usize, &Reconstruction)) -> Opti
 }
 
 /// Says which distances between images of a component no point tells, where there are any.
-pub(super) fn lengths_note((component, model): (usize, &Reconstruction), names: &[String]) -> Option<String> {
+pub(super) fn lengths_note((component, model): (usize, &Reconstruction)) -> Option<String> {
     let percents = || model.lengths.iter().map(|length| 100.0 * length.deviation);
     let (least, most) = (percents().reduce(f64::min)?, percents().reduce(f64::max)?);
+    let name = |image: ImageId| model.images[image.index()].name.as_str();
     let steps: Vec<String> = (model.lengths.iter())
-        .map(|length| format!("{} from {}", names[length.to.index()], names[length.from.index()]))
+        .map(|length| format!("{} from {}", name(length.to), name(length.from)))
         .collect();
     Some(format!(
         "distances{} rest on what lies beside the points of one pair and on the floor, not on points that a third \

@@ -173,11 +173,12 @@ fn add_left_apart(graph: &mut JobGraph<'_>, model: JobId, order: Vec<usize>) -> 
 fn left_apart(model: &MapperOutput, num_images: usize) -> LeftApart {
     let pairs_of = |images: usize| (images * images.saturating_sub(1) / 2) as u64;
     let known_pairs = model.components.iter().map(|component| pairs_of(component.registered().count())).sum();
-    let pairs = pairs_of(num_images);
     let Some(largest) = model.components.first() else {
+        let pairs = pairs_of(num_images);
         return LeftApart { images: (0..num_images as u32).collect(), known_pairs, pairs };
     };
-    // All components list the same images, those that have features.
+    // All components list the same images, those that have features: others cannot come together with any.
+    let pairs = pairs_of(largest.images.len());
     let apart = largest.images.iter().filter(|image| image.world_from_camera.is_none());
     let place = |image: &ReconstructionImage| Some(image_of_place_holder(&image.name)? as u32);
     LeftApart { images: apart.filter_map(place).collect(), known_pairs, pairs }

@@ -121,15 +121,17 @@ impl SceneRecipe {
         scene: &SceneFile,
     ) -> (Vec<String>, Vec<String>) {
         let Self { names, measured, .. } = self;
-        let models = || output.components.iter().enumerate();
+        // With the names that images have in the scene, of which those without features are none.
+        let models = || scene.components.iter().enumerate();
         let contradicted = (output.components.iter())
             .zip(&output.report.georegistrations)
             .flat_map(|(component, placed)| measured.warnings(component, placed.as_ref()));
         let warnings = output.report.warnings.iter().cloned().chain(contradicted);
-        let accuracies: Vec<Option<Accuracy>> = (output.components.iter().zip(&scene.errors))
-            .map(|(model, errors)| Accuracy::of_model(model, errors.as_ref()?))
+        let accuracies: Vec<(&Reconstruction, Accuracy)> = (scene.components.iter().zip(&scene.errors))
+            .filter_map(|(model, errors)| Some((model, Accuracy::of_model(model, errors.as_ref()?)?)))
             .collect();
-        let of_largest = accuracies.first().and_then(Option::as_ref);
+        let of_largest =
+            accuracies.iter().find(|(model, _)| scene.main().is_some_and(|main| std::ptr::eq(main, *model)));
         let unit = if scene.origin.is_some() { " m" } else { "" };
         let relative = scene.origin.filter(|origin| !has_altitude(*origin)).map(|_| {
             "the measured positions have no altitudes: heights are relative, and left out where WGS84 is told".to_owned()
@@ -140,15 +142,15 @@ impl SceneRecipe {
         let warnings = warnings
             .map(|text| with_names(&text, names))
             .chain(doubts.filter_map(|(component, doubt)| doubt.warning(component)))
-            .chain(accuracies.iter().flatten().filter_map(|accuracy| accuracy.warning(names)))
+            .chain(accuracies.iter().filter_map(|(model, accuracy)| accuracy.warning(model)))
             .chain(recall.as_ref().and_then(Recall::warning))
             .chain(fixes.as_deref().and_then(positions::warning));
         let notes = (output.report.merges.iter().filter_map(MergeRecord::sentence))
             .chain(recall.as_ref().map(Recall::note))
             .chain(fixes.as_deref().map(|fixes| positions::note(fixes, names.len())))
             .chain(relative)
-            .chain(of_largest.and_then(|accuracy| accuracy.note(names, unit)))
-            .chain(models().filter_map(|model| lengths_note(model, names)))
+            .chain(of_largest.and_then(|(model, accuracy)| accuracy.note(model, unit)))
+            .chain(models().filter_map(lengths_note))
             .chain(models().filter_map(stretch_note))
             .chain(scene.errors.iter().enumerate().filter_map(shared_errors_note));
         (warnings.collect(), notes.collect())

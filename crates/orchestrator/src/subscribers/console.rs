@@ -1,4 +1,4 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::IsTerminal;
 use std::sync::{Mutex, PoisonError};
 
@@ -27,6 +27,8 @@ const STAGES: [&str; 12] = [
 pub struct Console {
     terminal: bool,
     state: Mutex<State>,
+    /// What was said of jobs that failed.
+    failures: Mutex<BTreeSet<String>>,
 }
 
 #[derive(Default)]
@@ -46,7 +48,11 @@ struct Stage {
 impl Console {
     /// For this process's standard error.
     pub fn new() -> Self {
-        Self { terminal: std::io::stderr().is_terminal(), state: Mutex::default() }
+        Self {
+            terminal: std::io::stderr().is_terminal(),
+            state: Mutex::default(),
+            failures: Mutex::default(),
+        }
     }
 
     fn step(&self, kind: &str, hit: bool) {
@@ -122,7 +128,11 @@ impl Observer for Console {
             Event::Finished { kind, .. } | Event::Unkept { kind, .. } => self.step(kind, false),
             Event::Skipped { kind, .. } => self.leave_out(kind),
             Event::Failed { kind, job, reason } => {
-                self.tell(&format!("warning: {kind} {job}: {reason}"));
+                let text = format!("warning: {kind} {job}: {reason}");
+                // Further graphs of a command try it again.
+                if self.failures.lock().unwrap_or_else(PoisonError::into_inner).insert(text.clone()) {
+                    self.tell(&text);
+                }
                 self.step(kind, false);
             }
             Event::Note { text } => self.tell(&format!("note: {text}")),

@@ -126,7 +126,7 @@ impl CameraPrior {
     /// What holds for the usual photo, as standard deviations: the principal point lies within 0.5 % of the longer side of
     /// the image's centre, the first radial coefficient is within 0.2, further ones within 0.05, tangential ones within
     /// 0.001, and pixels are square to 0.1 %; nothing is known of the focal length. Stitched panoramas are stretched
-    /// ahead against the sides by 0.4 %, otherwise by 0.1 %, and twisted by 0.2 %, and no loss lets go of that. `None` for plain panoramas,
+    /// ahead against the sides by 0.3 %, otherwise by 0.1 %, and twisted by 0.1 to 0.15 %, and no loss lets go of that. `None` for plain panoramas,
     /// which have nothing to estimate.
     ///
     /// Calibrations of phones, action and system cameras put the principal point 0.1–1 % off the centre. Photos that were

@@ -37,7 +37,8 @@ impl PoseHypothesis {
             let Some(point) = model.point(id) else { return false };
             let direction = world_from_camera.inverse_transform_point(&point.position).normalize();
             let error = (direction - rays.bearings[feature as usize]).norm();
-            error <= max_error_sigma * rays.sigmas[feature as usize]
+            let sigma = rays.sigmas[feature as usize];
+            sigma.is_finite() && error <= max_error_sigma * sigma
         };
         let inliers: Vec<(u32, PointId)> = matches.iter().copied().filter(agrees).collect();
         let visibility = visibility(model, image, &world_from_camera, &inliers);

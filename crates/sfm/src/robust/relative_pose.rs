@@ -474,6 +474,10 @@ impl Consensus for RotationConsensus<'_> {
     #[inline(always)]
     fn squared_residual(&self, model: &Matrix3<f64>, index: usize, _bound: f64) -> f64 {
         let (a, b) = self.0.variances[index];
+        if !(a + b).is_finite() {
+            // A keypoint outside of the lens's domain has no ray.
+            return f64::INFINITY;
+        }
         AngularResidual::squared(&self.0.second[index], &(model * self.0.first[index]), 1.0 / (a + b))
     }
 

@@ -42,9 +42,7 @@ impl Joint {
     /// How much of the scene, and of what is seen from both sides, tells the scale beyond a hinge.
     fn scale_support(&self, beyond: &Beyond, tracks: &[Vec<usize>]) -> usize {
         let is_beyond = |standpoint: &usize| beyond.slots.binary_search(standpoint).is_ok();
-        let of_scene = |&slot: &usize| {
-            self.direct[slot].len() + self.viewed[slot] + self.walls[slot] + self.met[slot].len()
-        };
+        let of_scene = |&slot: &usize| self.direct[slot].len() + self.viewed[slot] + self.walls[slot];
         let crosses = |track: &&Vec<usize>| {
             track.iter().any(is_beyond) && track.iter().any(|at| *at != beyond.hinge && !is_beyond(at))
         };
