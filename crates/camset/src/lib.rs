@@ -77,7 +77,7 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 48: photos among stitched panoramas err as these do; photos that the
 /// joint refinement leaves behind are where they are alone. 49: sets whose photos look otherwise than the scene are uncertain.
 /// 50: photos among stitched panoramas are stretched as windows of these are. 51: photos that their set leaves with fewer of their
-/// scene points stand as they do alone. 52: unknown focal lengths by P4Pf, too. 53: covariances know what the loss costs.
+/// scene points stand as they do alone. 52: unknown focal lengths by P4Pf, too. 53: told focal lengths are asked for by the joint refinement.
 pub const VERSION: u32 = 53;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.

@@ -33,7 +33,7 @@ fn photos_of_unknown_intrinsics_are_mapped_again_with_the_cameras_that_they_tell
     };
 
     let planned = build("plan");
-    assert!(said(&planned).contains("cameras are estimated by a first model"), "{}", said(&planned));
+    assert!(said(&planned).contains("focal lengths are sought by photos of one spot"), "{}", said(&planned));
     let built = build("build");
     assert_eq!(built.status.code(), Some(0), "{}", said(&built));
     assert!(said(&built).contains("focal length estimated with the scene"), "{}", said(&built));

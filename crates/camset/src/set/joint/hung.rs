@@ -1,7 +1,5 @@
 //! Baselines whose length planes tell, and the photos that hang on them.
 
-use std::collections::BTreeSet;
-
 use nalgebra::Matrix6;
 use setloc_sfm::{BaselineLength, ImageId, Rigid};
 
@@ -129,10 +127,7 @@ impl Component<'_> {
     /// The photos that no common points tie to the reference but through the pair.
     fn beyond(&self, standpoints: &[usize], slots: [usize; 3]) -> Vec<bool> {
         let tracks = (0..self.model.points.len()).map(|local| {
-            // Several photos of one standpoint tie nothing more.
-            let seen_from: BTreeSet<usize> =
-                self.track(local).into_iter().map(|(slot, _)| standpoints[slot]).collect();
-            Vec::from_iter(seen_from)
+            self.track(local).into_iter().map(|(slot, _)| standpoints[slot]).collect::<Vec<_>>()
         });
         let ties = Ties::new(standpoints.len(), tracks);
         let [reference, from, to] = slots.map(|slot| standpoints[slot]);
