@@ -33,8 +33,8 @@ const LOSS_SCALE: f64 = 1.0;
 /// covariances of the poses if asked.
 ///
 /// Cameras that are not known are estimated, from what holds for usual photos on; where covariances are asked for, photos of known
-/// ones get another focal length or are stretched if that spares more than noise would ([`crate::stretch`]). Poses of fewer than three observations stay where
-/// they are.
+/// ones get another focal length or are stretched if that spares more than noise would ([`crate::stretch`]). Poses of fewer than
+/// three observations stay where they are.
 pub(crate) fn refine_jointly(
     model: &mut JointModel,
     scene: &Scene<'_>,
@@ -125,13 +125,16 @@ const LEAST_SPARED_BY_FOCAL: f64 = 0.01;
 /// And of what stretches spare, which stand for it as far as they may: 0.9 or more where it is the focal length.
 const SHARE_OF_STRETCH: f64 = 0.7;
 
-/// The problem with the focal lengths of known cameras free, and these cameras.
+/// The problem with the focal lengths that photos are told free, and their cameras.
 fn refocused(model: &JointModel, problem: &BundleProblem) -> (BundleProblem, Vec<usize>) {
     let mut refocused = problem.clone();
     refocused.camera_freedom.resize(refocused.cameras.len(), IntrinsicsFreedom::FIXED);
     let is_used = |at: &usize| model.photos.iter().any(|photo| photo.camera == *at);
-    let known = |at: &usize| model.cameras[*at].is_known() && is_used(at);
-    let cameras: Vec<usize> = (0..model.cameras.len()).filter(known).collect();
+    let has_told = |at: &usize| {
+        let camera = &model.cameras[*at];
+        camera.is_known() && !camera.camera.is_panoramic() && is_used(at)
+    };
+    let cameras: Vec<usize> = (0..model.cameras.len()).filter(has_told).collect();
     for &at in &cameras {
         let camera = model.cameras[at].camera.clone();
         let free = JointCamera { known: KnownOfCamera::AllButFocal(camera.clone()), camera };

@@ -176,7 +176,7 @@ pub struct SuspiciousNeighbours {
     pub second: ImageId,
     /// Points of the first that the second sees from nearly the same place.
     pub expected: usize,
-    /// Those that it does see.
+    /// Points that both see, from wherever.
     pub shared: usize,
     /// Whether more than this tells a fold from trees or a wall that stand between: many matches of either contradict the model, or
     /// either shares nothing at all with two that it stands together with.

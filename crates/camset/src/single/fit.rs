@@ -204,7 +204,8 @@ impl Sought<'_> {
             let (bearing, sigma) = (rays.rays.bearings[feature], rays.rays.sigmas[feature]);
             if bearing.z > 0.0 && sigma.is_finite() {
                 pixels.push(Vector2::new(bearing.x, bearing.y) * (focal / bearing.z));
-                sigmas.push(sigma * focal);
+                // A pixel off the axis spans less of an angle, of its two sides cos^1.5 in the mean.
+                sigmas.push(sigma * focal / bearing.z.powf(1.5));
                 points.push(scene.index.position(found.point));
             }
         }

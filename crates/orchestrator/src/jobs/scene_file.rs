@@ -127,11 +127,11 @@ impl SceneRecipe {
             .zip(&output.report.georegistrations)
             .flat_map(|(component, placed)| measured.warnings(component, placed.as_ref()));
         let warnings = output.report.warnings.iter().cloned().chain(contradicted);
-        let accuracies: Vec<(&Reconstruction, Accuracy)> = (scene.components.iter().zip(&scene.errors))
-            .filter_map(|(model, errors)| Some((model, Accuracy::of_model(model, errors.as_ref()?)?)))
-            .collect();
-        let of_largest =
-            accuracies.iter().find(|(model, _)| scene.main().is_some_and(|main| std::ptr::eq(main, *model)));
+        let accuracies: Vec<Option<(&Reconstruction, Accuracy)>> =
+            (scene.components.iter().zip(&scene.errors))
+                .map(|(model, errors)| Some((model, Accuracy::of_model(model, errors.as_ref()?)?)))
+                .collect();
+        let of_largest = accuracies.first().and_then(Option::as_ref);
         let unit = if scene.origin.is_some() { " m" } else { "" };
         let relative = scene.origin.filter(|origin| !has_altitude(*origin)).map(|_| {
             "the measured positions have no altitudes: heights are relative, and left out where WGS84 is told".to_owned()
@@ -142,7 +142,7 @@ impl SceneRecipe {
         let warnings = warnings
             .map(|text| with_names(&text, names))
             .chain(doubts.filter_map(|(component, doubt)| doubt.warning(component)))
-            .chain(accuracies.iter().filter_map(|(model, accuracy)| accuracy.warning(model)))
+            .chain(accuracies.iter().flatten().filter_map(|(model, accuracy)| accuracy.warning(model)))
             .chain(recall.as_ref().and_then(Recall::warning))
             .chain(fixes.as_deref().and_then(positions::warning));
         let notes = (output.report.merges.iter().filter_map(MergeRecord::sentence))
