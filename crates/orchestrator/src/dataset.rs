@@ -10,7 +10,7 @@ mod unread;
 pub use cameras::CameraBook;
 pub use geo::{GeoBook, GeoSource};
 pub use images::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, with_told_cameras};
-pub use truth::Truth;
+pub use truth::{Truth, rigid_of};
 pub use unread::unread_images;
 
 use std::collections::BTreeMap;

@@ -36,16 +36,16 @@ impl ImportedModel {
     /// With file and place.
     pub fn read_colmap(folder: &Path) -> Result<Self> {
         let format = ColmapFormat::of(folder)?;
-        let images = format.images(folder)?;
-        let file = folder.join(format.file("cameras"));
+        let file = format.file("cameras");
+        let path = folder.join(&file);
         let cameras = match format {
-            ColmapFormat::Binary => colmap_binary::cameras(&file)?,
-            ColmapFormat::Text => colmap_text::cameras(&file)?,
+            ColmapFormat::Binary => colmap_binary::cameras(&path)?,
+            ColmapFormat::Text => colmap_text::cameras(&path)?,
         };
-        for (name, (camera, _)) in &images {
-            let known = cameras.contains_key(camera);
-            anyhow::ensure!(known, "{} has no camera {camera}, which {name} was taken with", file.display());
-        }
+        let images = format.images(folder, |camera| {
+            anyhow::ensure!(cameras.contains_key(&camera), "{file} has no camera {camera}");
+            Ok(())
+        })?;
         Ok(Self { cameras, images })
     }
 
@@ -105,11 +105,12 @@ impl ColmapFormat {
         format!("{part}.{extension}")
     }
 
-    fn images(self, folder: &Path) -> Result<Images> {
+    /// The images of the model in a folder, each of whose cameras is checked.
+    fn images(self, folder: &Path, check: impl Fn(u32) -> Result<()>) -> Result<Images> {
         let file = folder.join(self.file("images"));
         match self {
-            Self::Binary => colmap_binary::images(&file),
-            Self::Text => colmap_text::images(&file),
+            Self::Binary => colmap_binary::images(&file, check),
+            Self::Text => colmap_text::images(&file, check),
         }
     }
 }
@@ -178,8 +179,9 @@ mod tests {
         assert!(error_of(good, "1 1 0 0 0 0 0 x 1 a.jpg\n").contains("images.txt, line 1"));
         assert!(error_of(good, "1 1 0 0 0 0 0 0 1\n").contains("images.txt, line 1"));
         assert!(error_of(good, "1 0 0 0 0 0 0 0 1 a.jpg\n").contains("rotation is zero"));
-        let lost = error_of(good, "\n1 1 0 0 0 0 0 0 2 a.jpg\n");
-        assert!(lost.contains("cameras.txt has no camera 2, which a.jpg was taken with"), "{lost}");
+        assert!(
+            error_of(good, "\n1 1 0 0 0 0 0 0 2 a.jpg\n").contains("line 2: cameras.txt has no camera 2")
+        );
     }
 
     #[test]

@@ -2,6 +2,8 @@ use std::collections::BTreeMap;
 
 use setloc_sfm::Rigid;
 
+use super::figures::extent;
+
 /// Thresholds in degrees at which the area under the recall curve is given.
 pub const AUC_THRESHOLDS_DEG: [f64; 5] = [0.1, 0.5, 1.0, 5.0, 10.0];
 
@@ -12,8 +14,7 @@ pub const AUC_THRESHOLDS_DEG: [f64; 5] = [0.1, 0.5, 1.0, 5.0, 10.0];
 /// direction, the rotation alone counts.
 pub fn auc_percent(estimated: &BTreeMap<String, Rigid>, truth: &BTreeMap<String, Rigid>) -> [f64; 5] {
     let names: Vec<&String> = truth.keys().collect();
-    let apart = |a: &Rigid, b: &Rigid| (a.translation - b.translation).norm();
-    let extent = truth.values().flat_map(|a| truth.values().map(move |b| apart(a, b))).fold(0.0, f64::max);
+    let extent = extent(truth.values());
     let mut errors = Vec::new();
     for (at, first) in names.iter().enumerate() {
         for second in &names[at + 1..] {
@@ -21,7 +22,8 @@ pub fn auc_percent(estimated: &BTreeMap<String, Rigid>, truth: &BTreeMap<String,
             errors.push(pair.map_or(f64::INFINITY, |(a, b)| {
                 let (true_a, true_b) = (&truth[*first], &truth[*second]);
                 let rotation = rotation_error(a, b, true_a, true_b);
-                let have_direction = apart(true_a, true_b) > ONE_PLACE * extent;
+                let apart = (true_a.translation - true_b.translation).norm();
+                let have_direction = apart > ONE_PLACE * extent;
                 let direction = if have_direction { direction_error(a, b, true_a, true_b) } else { 0.0 };
                 rotation.max(direction).to_degrees()
             }));

@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 
-use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Matrix6, Vector3};
 use serde::Serialize;
 use setloc_features::ImageFeatures;
 use setloc_sfm::{Observation, Reconstruction, ReconstructionPoint, Rigid, Similarity, nearest_rotation};
@@ -74,8 +74,7 @@ pub struct Alignment {
 impl Alignment {
     /// Of poses that are in the truth's frame.
     pub fn none() -> Self {
-        let same =
-            Similarity { scale: 1.0, rotation: UnitQuaternion::identity(), translation: Vector3::zeros() };
+        let same = Similarity::identity();
         Self { truth_from_scene: same, by_poses: same, misplaced: Vec::new() }
     }
 
@@ -93,7 +92,10 @@ impl Alignment {
     /// Least squares over the centres of the images that both know, without those that are misplaced; `None` with fewer
     /// than 3 or all in one line.
     pub fn of_centres(estimated: &BTreeMap<String, Rigid>, truth: &BTreeMap<String, Rigid>) -> Option<Self> {
-        let mut common = common(estimated, truth);
+        Self::over_centres(common(estimated, truth))
+    }
+
+    fn over_centres(mut common: Vec<Compared<'_>>) -> Option<Self> {
         let misplaced = set_misplaced_aside(&mut common);
         let truth_from_scene = by_centres(&common)?;
         let by_poses = by_poses(&common).unwrap_or(truth_from_scene);
@@ -109,7 +111,7 @@ impl Alignment {
         let mut common = common(estimated, truth);
         let centers: Vec<_> = common.iter().map(|image| image.own.translation).collect();
         if spread_sideways(&centers) >= MIN_SIDEWAYS {
-            return Self::of_centres(estimated, truth);
+            return Self::over_centres(common);
         }
         let misplaced = set_misplaced_aside(&mut common);
         let by_poses = by_poses(&common)?;
@@ -155,6 +157,12 @@ fn spread_sideways(points: &[Vector3<f64>]) -> f64 {
     if squares[2] > 0.0 { (squares[1] / squares[2]).sqrt() } else { 0.0 }
 }
 
+/// Largest distance between the centres of some poses, 0 of none.
+pub(super) fn extent<'p>(poses: impl Iterator<Item = &'p Rigid>) -> f64 {
+    let centers: Vec<Vector3<f64>> = poses.map(|pose| pose.translation).collect();
+    centers.iter().flat_map(|a| centers.iter().map(move |b| (a - b).norm())).fold(0.0, f64::max)
+}
+
 /// A pose in the scene and the true one.
 struct Compared<'a> {
     name: &'a str,
@@ -179,8 +187,7 @@ const MOST_COMPARISONS: usize = 10_000_000;
 /// Where all are near where least squares of all have them, none is. Otherwise one image's pose and its distance to
 /// another tell a similarity; of these the one counts by which most are near.
 fn set_misplaced_aside(common: &mut Vec<Compared<'_>>) -> Vec<String> {
-    let apart = |a: &Compared<'_>, b: &Compared<'_>| (a.true_.translation - b.true_.translation).norm();
-    let extent = common.iter().flat_map(|a| common.iter().map(|b| apart(a, b))).fold(0.0, f64::max);
+    let extent = extent(common.iter().map(|image| image.true_));
     let is_near = |image: &Compared<'_>, truth_from_scene: &Similarity| {
         let found = truth_from_scene.transform_point(&image.own.translation);
         (found - image.true_.translation).norm() <= MISPLACED * extent
@@ -192,7 +199,7 @@ fn set_misplaced_aside(common: &mut Vec<Compared<'_>>) -> Vec<String> {
     let of_two = |a: &Compared<'_>, b: &Compared<'_>| {
         let length = (a.own.translation - b.own.translation).norm();
         let rotation = a.true_.rotation * a.own.rotation.inverse();
-        let scale = apart(a, b) / length;
+        let scale = (a.true_.translation - b.true_.translation).norm() / length;
         let translation = a.true_.translation - rotation * a.own.translation * scale;
         (length > 0.0 && scale > 0.0).then_some(Similarity { scale, rotation, translation })
     };
@@ -330,6 +337,8 @@ pub fn mean_angular_error_px(
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::UnitQuaternion;
+
     use super::*;
 
     #[test]

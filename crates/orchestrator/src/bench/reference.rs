@@ -7,10 +7,10 @@
 use std::collections::BTreeMap;
 
 use anyhow::Result;
-use nalgebra::Vector3;
 use serde::Serialize;
 use setloc_sfm::Rigid;
 
+use super::figures::extent;
 use super::run::{BenchOptions, poses_of};
 use crate::building::{BuildOutcome, SceneSource, build_scene};
 use crate::dataset::ImageFolder;
@@ -64,15 +64,13 @@ impl JointReference {
     }
 
     fn of(poses: BTreeMap<String, Rigid>, scene: &[String], photos: &[String]) -> Self {
-        let centers: Vec<Vector3<f64>> =
-            scene.iter().filter_map(|name| Some(poses.get(name)?.translation)).collect();
+        let of_scene: Vec<&Rigid> = scene.iter().filter_map(|name| poses.get(name)).collect();
         let among = |names: &[String]| names.iter().filter(|name| poses.contains_key(*name)).count();
-        let apart = |a: &Vector3<f64>| centers.iter().map(|b| (a - b).norm()).fold(0.0, f64::max);
         let reference = Self {
-            scene_images: centers.len(),
+            scene_images: of_scene.len(),
             photos: among(photos),
             of_photos: photos.len(),
-            extent: centers.iter().map(apart).fold(0.0, f64::max),
+            extent: extent(of_scene.iter().copied()),
             poses: BTreeMap::new(),
         };
         if reference.scene_images >= MIN_SCENE_IMAGES && reference.photos > 0 {
@@ -95,7 +93,7 @@ impl JointReference {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::UnitQuaternion;
+    use nalgebra::{UnitQuaternion, Vector3};
 
     use super::*;
 

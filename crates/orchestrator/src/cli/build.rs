@@ -228,22 +228,23 @@ fn planned_cameras<'g>(
         guess_by_turns(&session()?, name, &mut images, alike, params, seed)?;
     }
     // A second model only where the first leaves doubt.
+    let mut told = None;
     for _ in 0..2 {
-        let inputs = SceneInputs { images: &images, ..inputs };
+        let inputs = SceneInputs { images: told.as_deref().unwrap_or(&images), ..inputs };
         let mut graph = JobGraph::default();
         add_first_model(&mut graph, inputs)?;
         if !is_stored(&graph, store) {
             print::note("cameras are estimated by a first model, and what follows from them is not listed");
             return Ok(Planned::Jobs(graph));
         }
-        let first = tell_cameras(&session()?, name, inputs)?;
-        let Some(told) = first.told else { break };
-        images = told;
-        if !first.is_doubtful {
+        let found = tell_cameras(&session()?, name, inputs)?;
+        let is_last = found.told.is_none() || !found.is_doubtful;
+        told = found.told.or(told);
+        if is_last {
             break;
         }
     }
-    Ok(Planned::Known(images))
+    Ok(Planned::Known(told.unwrap_or_else(|| inputs.images.to_vec())))
 }
 
 /// Neither the scene nor what is exported may replace what the scene is made from.

@@ -32,11 +32,15 @@ impl TryFrom<WrittenPose> for TruthPose {
     type Error = &'static str;
 
     fn try_from(written: WrittenPose) -> Result<Self, Self::Error> {
-        let [w, x, y, z] = written.q_wxyz;
-        let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6);
-        let rotation = rotation.ok_or("`q_wxyz` is zero, which is no rotation")?;
-        Ok(Self(Rigid::new(rotation, Vector3::from(written.center))))
+        let pose = rigid_of(written.q_wxyz, written.center);
+        pose.map(Self).ok_or("`q_wxyz` is zero, which is no rotation")
     }
+}
+
+/// The transform of a quaternion, w first and of any length but 0, and a translation.
+pub fn rigid_of([w, x, y, z]: [f64; 4], translation: [f64; 3]) -> Option<Rigid> {
+    let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6)?;
+    Some(Rigid::new(rotation, Vector3::from(translation)))
 }
 
 impl Truth {

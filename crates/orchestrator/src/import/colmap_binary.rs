@@ -33,8 +33,8 @@ pub(super) fn cameras(file: &Path) -> Result<BTreeMap<u32, Camera>> {
     })
 }
 
-/// Reads `images.bin`.
-pub(super) fn images(file: &Path) -> Result<Images> {
+/// Reads `images.bin`; `check` is asked for each image's camera.
+pub(super) fn images(file: &Path, check: impl Fn(u32) -> Result<()>) -> Result<Images> {
     read(file, |bytes| {
         let mut images = Images::new();
         for _ in 0..bytes.u64()? {
@@ -46,7 +46,9 @@ pub(super) fn images(file: &Path) -> Result<Images> {
             let (camera, name) = (bytes.u32()?, bytes.text()?);
             let points = bytes.u64()?;
             bytes.skip(points.saturating_mul(BYTES_OF_POINT))?;
-            let camera_from_world = rigid(pose).with_context(|| format!("image {number}, {name}"))?;
+            let place = || format!("image {number}, {name}");
+            let camera_from_world = rigid(pose).with_context(place)?;
+            check(camera).with_context(place)?;
             images.insert(name, (camera, camera_from_world.inverse()));
         }
         Ok(images)
@@ -141,7 +143,7 @@ mod tests {
         assert_eq!((camera.model, camera.width, camera.height), (CameraModel::SimplePinhole, 640, 480));
         assert_eq!(camera.params, [500.0, 320.0, 240.0]);
         let (_folder, file) = written("images.bin", &image_bytes([1.0, 0.0, 0.0, 0.0]));
-        let images = images(&file).unwrap();
+        let images = images(&file, |_| Ok(())).unwrap();
         assert_eq!(images.keys().collect::<Vec<_>>(), ["a b.jpg"]);
         let (camera, pose) = images["a b.jpg"];
         assert_eq!((camera, pose.translation), (7, Vector3::new(-4.0, -5.0, -6.0)));
@@ -163,7 +165,7 @@ mod tests {
 
         let error_of_images = |bytes: &[u8]| {
             let (_folder, file) = written("images.bin", bytes);
-            format!("{:#}", images(&file).unwrap_err())
+            format!("{:#}", images(&file, |_| Ok(())).unwrap_err())
         };
         let whole = image_bytes([1.0, 0.0, 0.0, 0.0]);
         for length in 0..whole.len() {

@@ -24,8 +24,8 @@ pub(super) fn cameras(file: &Path) -> Result<BTreeMap<u32, Camera>> {
     Ok(cameras)
 }
 
-/// Reads `images.txt`.
-pub(super) fn images(file: &Path) -> Result<Images> {
+/// Reads `images.txt`; `check` is asked for each image's camera.
+pub(super) fn images(file: &Path, check: impl Fn(u32) -> Result<()>) -> Result<Images> {
     let text = read(file)?;
     let mut images = Images::new();
     let mut lines = text.lines().enumerate();
@@ -35,6 +35,7 @@ pub(super) fn images(file: &Path) -> Result<Images> {
             lines.next();
             let place = || format!("{}, line {}", file.display(), at + 1);
             let (name, number, pose) = parse_image(line).with_context(place)?;
+            check(number).with_context(place)?;
             images.insert(name, (number, pose));
         }
     }

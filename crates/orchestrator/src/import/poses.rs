@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 use setloc_camset::Verdict;
 use setloc_sfm::Rigid;
 
 use super::ColmapFormat;
 use super::colmap_text::is_content;
-use crate::dataset::Truth;
+use crate::dataset::{Truth, rigid_of};
 use crate::error::Hinted;
 
 /// Reads `world_from_camera` of images by name.
@@ -51,7 +51,7 @@ fn of_folder(folder: &Path) -> Result<BTreeMap<String, Rigid>> {
     if truth.is_file() {
         return Ok(Truth::read(&truth)?.poses(""));
     }
-    let images = ColmapFormat::of(folder)?.images(folder)?;
+    let images = ColmapFormat::of(folder)?.images(folder, |_| Ok(()))?;
     Ok(images.into_iter().map(|(name, (_, pose))| (name, pose)).collect())
 }
 
@@ -87,9 +87,7 @@ pub(super) fn world_from_camera(numbers: &[&str]) -> Result<Rigid> {
 /// The transform of 4 numbers of rotation (w first) and 3 of translation.
 pub(super) fn rigid([w, x, y, z, tx, ty, tz]: [f64; 7]) -> Result<Rigid> {
     anyhow::ensure!([w, x, y, z, tx, ty, tz].iter().all(|value| value.is_finite()), "a number is not finite");
-    let rotation =
-        UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-6).context("the rotation is zero")?;
-    Ok(Rigid::new(rotation, Vector3::new(tx, ty, tz)))
+    rigid_of([w, x, y, z], [tx, ty, tz]).context("the rotation is zero")
 }
 
 pub(super) fn finite(text: &str) -> Result<f64> {
