@@ -3,6 +3,8 @@
 //! What a large component refuses, by what walls hide from it, makes components of its own, and of the pairs that are left there more are
 //! wrong than elsewhere: the right ones are with the images that are gone.
 
+use std::{cmp::Reverse, collections::BTreeMap};
+
 use crate::{ImageId, OutvotedPair, PairGeometry, Reconstruction, TwoViewKind, quality::HEAVY_MATCHES};
 
 /// Matches of a pair with an image of a larger component for each point of the strongest link within an image's own from which on it
@@ -16,18 +18,22 @@ pub(crate) fn estranged(
     component: &Reconstruction,
     larger: &[Reconstruction],
     pairs: &[PairGeometry],
-    shared_points: impl Fn(ImageId, ImageId) -> usize,
+    most_shared: impl Fn(ImageId) -> usize,
 ) -> Vec<OutvotedPair> {
     let is_in = |of: &Reconstruction, image: ImageId| of.images[image.index()].world_from_camera.is_some();
+    // By image, its matches with the one of a larger component that it has most with.
+    let mut strongest: BTreeMap<ImageId, (usize, Reverse<ImageId>)> = BTreeMap::new();
+    for pair in pairs.iter().filter(|pair| pair.two_view.kind == TwoViewKind::General) {
+        for (image, other) in [(pair.first, pair.second), (pair.second, pair.first)] {
+            if is_in(component, image) && larger.iter().any(|larger| is_in(larger, other)) {
+                let most = strongest.entry(image).or_insert((0, Reverse(other)));
+                *most = (*most).max((pair.two_view.inliers.len(), Reverse(other)));
+            }
+        }
+    }
     let estranged = |image: ImageId| {
-        let strongest = (pairs.iter())
-            .filter(|pair| pair.two_view.kind == TwoViewKind::General)
-            .filter_map(|pair| Some((pair.two_view.inliers.len(), pair.seen_from(image)?.0)))
-            .filter(|(_, other)| larger.iter().any(|larger| is_in(larger, *other)))
-            .max_by_key(|&(matches, other)| (matches, std::cmp::Reverse(other)))?;
-        let (matches, second) = strongest;
-        let others = component.registered().filter(|&other| other != image);
-        let held_by = others.map(|other| shared_points(image, other)).max().unwrap_or(0);
+        let &(matches, Reverse(second)) = strongest.get(&image)?;
+        let held_by = most_shared(image);
         let pair = OutvotedPair { first: image, second, matches, held_by, side: vec![image] };
         (matches >= HEAVY_MATCHES && pair.weight() >= MIN_WEIGHT).then_some(pair)
     };

@@ -7,6 +7,7 @@
 
 mod alignment;
 pub mod bundle;
+mod common_views;
 mod direction;
 mod estranged;
 mod geometry;

@@ -1,16 +1,15 @@
 //! The quality gate: what in a finished model disagrees with its own evidence.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::{
+    cmp::Reverse,
+    collections::{BTreeMap, BTreeSet},
+};
 
-use nalgebra::Vector3;
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::{
     ImageId, PairGeometry, Reconstruction, ReconstructionImage, ReconstructionPoint, TwoViewKind,
-    estranged::estranged,
-    listed,
-    visibility::{is_in_image, is_same_view},
+    common_views::CommonViews, estranged::estranged, listed,
 };
 
 /// When to speak up.
@@ -208,19 +207,6 @@ pub struct QualityReport {
     pub weak_images: Vec<(ImageId, usize)>,
 }
 
-/// Tasks that the points are counted in; each needs memory for all pairs of images.
-const TASKS: usize = 4;
-
-/// What some of the points count for.
-struct Counts {
-    /// Points that both of two images see, by pair.
-    shared: Vec<u32>,
-    /// Points of the first that the second ought to see, by pair.
-    expected: Vec<u32>,
-    /// By image.
-    points_of: Vec<u32>,
-}
-
 /// Compares a component with the verified pairs that it and the larger ones were built from.
 pub fn assess(
     params: &QualityParams,
@@ -234,54 +220,7 @@ pub fn assess(
         images: n,
         ..QualityReport::default()
     };
-    let center =
-        |image: ImageId| reconstruction.images[image.index()].world_from_camera.map(|pose| pose.translation);
-    let in_image = |image: ImageId, position: &Vector3<f64>| {
-        reconstruction.images[image.index()].world_from_camera.is_some_and(|pose| {
-            is_in_image(reconstruction.camera_of(image), &pose.inverse_transform_point(position))
-        })
-    };
-    let count = |points: &[ReconstructionPoint]| {
-        let mut counts = Counts { shared: vec![0; n * n], expected: vec![0; n * n], points_of: vec![0; n] };
-        let mut sees = vec![false; n];
-        for point in points {
-            for seen in &point.track {
-                sees[seen.image.index()] = true;
-                counts.points_of[seen.image.index()] += 1;
-            }
-            for seen in &point.track {
-                let Some(observer) = center(seen.image) else { continue };
-                for other in reconstruction.registered().filter(|&other| other != seen.image) {
-                    let Some(candidate) = center(other) else { continue };
-                    let cell = seen.image.index() * n + other.index();
-                    if sees[other.index()] {
-                        counts.shared[cell] += 1;
-                    }
-                    if is_same_view(&point.position, &observer, &candidate)
-                        && in_image(other, &point.position)
-                    {
-                        counts.expected[cell] += 1;
-                    }
-                }
-            }
-            for seen in &point.track {
-                sees[seen.image.index()] = false;
-            }
-        }
-        counts
-    };
-    let share = reconstruction.points.len().div_ceil(TASKS).max(1);
-    let parts: Vec<Counts> = reconstruction.points.par_chunks(share).with_max_len(1).map(count).collect();
-    let sum = |of: fn(&Counts) -> &[u32], len: usize| {
-        let mut sums = vec![0_usize; len];
-        for part in &parts {
-            sums.iter_mut().zip(of(part)).for_each(|(sum, value)| *sum += *value as usize);
-        }
-        sums
-    };
-    let shared = sum(|counts| &counts.shared, n * n);
-    let expected = sum(|counts| &counts.expected, n * n);
-    let points_of = sum(|counts| &counts.points_of, n);
+    let views = CommonViews::of(reconstruction);
     // Of the geometries of one pair the model can have one only.
     let mut judged: BTreeMap<(ImageId, ImageId), (PairDisagreement, bool)> = BTreeMap::new();
     for pair in pairs {
@@ -290,7 +229,7 @@ pub fn assess(
             reconstruction.images[pair.second.index()].world_from_camera,
         );
         let (Some(first), Some(second)) = poses else { continue };
-        let used = shared[pair.first.index() * n + pair.second.index()];
+        let used = views.shared(pair.first, pair.second);
         let two_view = &pair.two_view;
         let found = PairDisagreement {
             first: pair.first,
@@ -319,37 +258,30 @@ pub fn assess(
     report.pairs = judged.len();
     let disagreements = judged.into_values().filter(|(_, any_agrees)| !any_agrees);
     report.disagreements = disagreements.map(|(found, _)| found).collect();
-    let shared_points = |a: usize, b: usize| shared[a * n + b].max(shared[b * n + a]);
-    let links = strongest_links(n, shared_points);
-    let spots = Groups::of_one_spot(&reconstruction.images);
+    let links = strongest_links(n, views.sharing());
+    let spots = of_one_spot(&reconstruction.images);
     let heavy: Vec<&PairDisagreement> = report.disagreements.iter().filter(|pair| pair.is_heavy()).collect();
     let contradicted: BTreeSet<ImageId> = heavy.iter().flat_map(|pair| [pair.first, pair.second]).collect();
     report.outvoted = heavy.into_iter().filter_map(|pair| outvoted(pair, &spots, &links)).collect();
-    let of_images = |a: ImageId, b: ImageId| shared_points(a.index(), b.index());
-    report.outvoted.extend(estranged(reconstruction, larger, pairs, of_images));
-    for first in reconstruction.registered() {
-        for second in reconstruction.registered().filter(|&second| second > first) {
-            let (forth, back) = (first.index() * n + second.index(), second.index() * n + first.index());
-            let (wanted, got) = (expected[forth] + expected[back], shared[forth] + shared[back]);
-            // One in the street sees nothing of what one behind a door sees, which has most of the street in plain view.
-            let is_near = |seen: usize, by: ImageId| {
-                seen as f64 >= params.min_expected_share * points_of[by.index()] as f64
-            };
-            let together = is_near(expected[forth], first) && is_near(expected[back], second);
-            if together
-                && wanted >= params.min_expected_points
-                && (got as f64) < params.min_shared_view * wanted as f64
-            {
-                let is_confirmed = contradicted.contains(&first) || contradicted.contains(&second);
-                let found =
-                    SuspiciousNeighbours { first, second, expected: wanted, shared: got, is_confirmed };
-                report.suspicious.push(found);
-            }
-        }
-        if points_of[first.index()] < params.min_image_points {
-            report.weak_images.push((first, points_of[first.index()]));
+    report.outvoted.extend(estranged(reconstruction, larger, pairs, |image| views.most_shared(image)));
+    let is_near =
+        |seen: usize, by: ImageId| seen as f64 >= params.min_expected_share * views.points_of(by) as f64;
+    for (first, second) in views.expecting() {
+        let [forth, back] = [views.between(first, second), views.between(second, first)];
+        let (wanted, got) = (forth.expected + back.expected, forth.shared + back.shared);
+        // One in the street sees nothing of what one behind a door sees, which has most of the street in plain view.
+        let together = is_near(forth.expected, first) && is_near(back.expected, second);
+        if together
+            && wanted >= params.min_expected_points
+            && (got as f64) < params.min_shared_view * wanted as f64
+        {
+            let is_confirmed = contradicted.contains(&first) || contradicted.contains(&second);
+            let found = SuspiciousNeighbours { first, second, expected: wanted, shared: got, is_confirmed };
+            report.suspicious.push(found);
         }
     }
+    let points = reconstruction.registered().map(|image| (image, views.points_of(image)));
+    report.weak_images = points.filter(|(_, points)| *points < params.min_image_points).collect();
     confirm_by_each_other(&mut report.suspicious);
     report
 }
@@ -384,46 +316,68 @@ const HEAVY_ROTATION_DEG: f64 = 30.0;
 const MIN_WEIGHT: f64 = 0.75;
 
 /// Two images and the points that they share.
-type LinkBetween = (usize, usize, usize);
+type LinkBetween = (ImageId, ImageId, usize);
 
-/// Images in groups that grow together, each by the number of its group.
+/// Groups of images that are tied together: disjoint sets, the smaller one joined to the larger.
 #[derive(Clone)]
-struct Groups(Vec<usize>);
+struct Groups {
+    /// Another image of the same group, itself for one of each.
+    toward: Vec<usize>,
+    /// Images of a group, by that one.
+    size: Vec<usize>,
+}
 
 impl Groups {
-    fn of_one_each(images: usize) -> Self {
-        Self((0..images).collect())
+    fn new(images: usize) -> Self {
+        Self { toward: (0..images).collect(), size: vec![1; images] }
     }
 
-    /// Images that were turned on one spot, to which the mapper gives exactly one centre; they need not share any point.
-    fn of_one_spot(images: &[ReconstructionImage]) -> Self {
-        let center = |at: usize| images[at].world_from_camera.map(|pose| pose.translation);
-        let first = |at| (0..at).find(|&other| center(at).is_some() && center(other) == center(at));
-        Self((0..images.len()).map(|at| first(at).unwrap_or(at)).collect())
+    fn len(&self) -> usize {
+        self.toward.len()
+    }
+
+    fn root(&self, mut image: usize) -> usize {
+        while self.toward[image] != image {
+            image = self.toward[image];
+        }
+        image
     }
 
     /// Makes the groups of two images one; `false` where they already are.
-    fn join(&mut self, a: usize, b: usize) -> bool {
-        let (kept, gone) = (self.0[a], self.0[b]);
-        for group in self.0.iter_mut().filter(|group| **group == gone) {
-            *group = kept;
+    fn union(&mut self, a: usize, b: usize) -> bool {
+        let [a, b] = [a, b].map(|image| self.root(image));
+        let (larger, smaller) = if self.size[a] >= self.size[b] { (a, b) } else { (b, a) };
+        if larger != smaller {
+            self.toward[smaller] = larger;
+            self.size[larger] += self.size[smaller];
         }
-        kept != gone
+        larger != smaller
     }
 
-    fn are_one(&self, a: usize, b: usize) -> bool {
-        self.0[a] == self.0[b]
+    fn equiv(&self, a: usize, b: usize) -> bool {
+        self.root(a) == self.root(b)
     }
 }
 
+/// Images that were turned on one spot, to which the mapper gives exactly one centre; they need not share any point.
+fn of_one_spot(images: &[ReconstructionImage]) -> Groups {
+    let mut spots = Groups::new(images.len());
+    let mut first_at: BTreeMap<[u64; 3], usize> = BTreeMap::new();
+    for (at, image) in images.iter().enumerate() {
+        let Some(pose) = image.world_from_camera else { continue };
+        // Adding zero makes one of both zeros.
+        let center = [0, 1, 2].map(|axis| (pose.translation[axis] + 0.0).to_bits());
+        spots.union(*first_at.entry(center).or_insert(at), at);
+    }
+    spots
+}
+
 /// The links that tie all images together by the most points each: the maximum spanning forest, strongest first.
-fn strongest_links(images: usize, points: impl Fn(usize, usize) -> usize) -> Vec<LinkBetween> {
-    let pairs = (0..images).flat_map(|a| (a + 1..images).map(move |b| (a, b)));
-    let mut links: Vec<LinkBetween> = pairs.map(|(a, b)| (a, b, points(a, b))).collect();
-    links.retain(|(.., points)| *points > 0);
-    links.sort_by_key(|&(a, b, points)| (std::cmp::Reverse(points), a, b));
-    let mut tied = Groups::of_one_each(images);
-    links.retain(|&(a, b, _)| tied.join(a, b));
+fn strongest_links(images: usize, links: impl Iterator<Item = LinkBetween>) -> Vec<LinkBetween> {
+    let mut links: Vec<LinkBetween> = links.collect();
+    links.sort_by_key(|&(a, b, points)| (Reverse(points), a, b));
+    let mut tied = Groups::new(images);
+    links.retain(|&(a, b, _)| tied.union(a.index(), b.index()));
     links
 }
 
@@ -431,26 +385,28 @@ fn strongest_links(images: usize, points: impl Fn(usize, usize) -> usize) -> Vec
 ///
 /// Images of one spot stay together, but for a pair of them.
 fn outvoted(pair: &PairDisagreement, spots: &Groups, links: &[LinkBetween]) -> Option<OutvotedPair> {
-    let (first, second) = (pair.first.index(), pair.second.index());
-    let images = spots.0.len();
-    let untied = if spots.are_one(first, second) { Groups::of_one_each(images) } else { spots.clone() };
+    let PairDisagreement { first, second, matches, .. } = *pair;
+    let images = spots.len();
+    let untied = if spots.equiv(first.index(), second.index()) { Groups::new(images) } else { spots.clone() };
     // The weakest link between the two is that with which the strongest ones first tie them.
     let mut tied = untied.clone();
     let weakest = links.iter().position(|&(a, b, _)| {
-        tied.join(a, b);
-        tied.are_one(first, second)
+        tied.union(a.index(), b.index());
+        tied.equiv(first.index(), second.index())
     })?;
     let held_by = links[weakest].2;
+    let found = OutvotedPair { first, second, matches, held_by, side: Vec::new() };
+    if found.weight() <= MIN_WEIGHT {
+        return None;
+    }
     let mut tied = untied;
     for (at, &(a, b, _)) in links.iter().enumerate() {
         if at != weakest {
-            tied.join(a, b);
+            tied.union(a.index(), b.index());
         }
     }
-    let side = (0..images).filter(|&image| tied.are_one(first, image));
-    let side = side.map(|image| ImageId(image as u32)).collect();
-    let PairDisagreement { first, second, matches, .. } = *pair;
-    Some(OutvotedPair { first, second, matches, held_by, side }).filter(|pair| pair.weight() > MIN_WEIGHT)
+    let side = (0..images).filter(|&image| tied.equiv(first.index(), image));
+    Some(OutvotedPair { side: side.map(|image| ImageId(image as u32)).collect(), ..found })
 }
 
 /// Matches from which on a single pair that contradicts the model is worth a word: chance does not make so many.
@@ -513,7 +469,7 @@ impl QualityReport {
             return None;
         }
         let mut worst: Vec<&PairDisagreement> = self.disagreements.iter().collect();
-        worst.sort_by_key(|pair| std::cmp::Reverse(pair.matches));
+        worst.sort_by_key(|pair| Reverse(pair.matches));
         let named = worst.into_iter().map(|pair| {
             let PairDisagreement { matches, used, rotation_deg, .. } = *pair;
             let how = if pair.is_unused() {
@@ -592,7 +548,7 @@ fn said_of_more_outvoted(others: usize) -> String {
 mod tests {
     use super::*;
     use crate::{CameraId, Observation, Rigid, TwoView};
-    use nalgebra::UnitQuaternion;
+    use nalgebra::{UnitQuaternion, Vector3};
     use setloc_features::{Camera, CameraModel, Match};
 
     fn image(name: &str, x: f64) -> ReconstructionImage {
@@ -601,6 +557,10 @@ mod tests {
             camera: CameraId(0),
             world_from_camera: Some(Rigid::new(UnitQuaternion::identity(), Vector3::new(x, 0.0, 0.0))),
         }
+    }
+
+    fn link((a, b, points): (u32, u32, usize)) -> LinkBetween {
+        (ImageId(a), ImageId(b), points)
     }
 
     #[test]
@@ -680,17 +640,14 @@ mod tests {
     #[test]
     fn a_pair_outvotes_what_holds_its_images_together_where_that_is_less() {
         // Two chains of three, tied by few points.
-        let points = |a: usize, b: usize| match (a, b) {
-            (0, 1) | (1, 2) | (3, 4) | (4, 5) => 400,
-            (0, 2) => 90,
-            (2, 3) => 60,
-            (1, 4) => 30,
-            (0, 6) => 20,
-            _ => 0,
-        };
-        let links = strongest_links(8, points);
-        assert_eq!(links, [(0, 1, 400), (1, 2, 400), (3, 4, 400), (4, 5, 400), (2, 3, 60), (0, 6, 20)]);
-        let spots = Groups::of_one_each(8);
+        let points = [
+            [(0, 1, 400), (0, 2, 90), (0, 6, 20), (1, 2, 400)],
+            [(1, 4, 30), (2, 3, 60), (3, 4, 400), (4, 5, 400)],
+        ];
+        let links = strongest_links(8, points.concat().into_iter().map(link));
+        let strongest = [(0, 1, 400), (1, 2, 400), (3, 4, 400), (4, 5, 400), (2, 3, 60), (0, 6, 20)];
+        assert_eq!(links, strongest.map(link));
+        let spots = Groups::new(8);
         let found = |first: u32, second: u32, matches: usize| {
             let (first, second) = (ImageId(first), ImageId(second));
             outvoted(&PairDisagreement { first, second, matches, used: 0, rotation_deg: 0.0 }, &spots, &links)
@@ -706,13 +663,8 @@ mod tests {
     #[test]
     fn images_of_one_spot_are_on_one_side_though_they_share_no_point() {
         let images = [0.0, 0.0, 1.0, 2.0].map(|x| image("a", x));
-        let spots = Groups::of_one_spot(&images);
-        let links = strongest_links(4, |a, b| match (a, b) {
-            (0, 2) => 400,
-            (1, 2) => 45,
-            (2, 3) => 60,
-            _ => 0,
-        });
+        let spots = of_one_spot(&images);
+        let links = strongest_links(4, [(0, 2, 400), (1, 2, 45), (2, 3, 60)].into_iter().map(link));
         let found = |first: u32, second: u32| {
             let (first, second) = (ImageId(first), ImageId(second));
             outvoted(

@@ -6,6 +6,10 @@ pub(crate) const SAME_VIEW_ANGLE_RAD: f64 = 0.35;
 /// Largest ratio of distances to the point that a descriptor surely survives.
 pub(crate) const SAME_VIEW_DISTANCE_RATIO: f64 = 1.5;
 
+/// How far from an observer a camera can be that sees a point much alike, in distances from the observer to the point: at the largest
+/// angle and ratio, by the law of cosines, 0.657.
+pub(crate) const FARTHEST_SAME_VIEW: f64 = 0.66;
+
 /// Whether a camera at `candidate` sees `point` much as a camera at `observer` does.
 ///
 /// Then a keypoint that one of them has ought to be found and matched in the other, unless something hides it.

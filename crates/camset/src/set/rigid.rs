@@ -357,7 +357,11 @@ fn rival_of_sights(
     rivals.map(support).max().unwrap_or(0)
 }
 
-/// Poses of the set from each ordered pair of photos that are localized alone: one gives the rotation, both the scale.
+/// Photos localized alone that give each of them a scale.
+const SCALING_PARTNERS: usize = 16;
+
+/// Poses of the set from photos that are localized alone: each gives the rotation, and with it those farthest from it in the set,
+/// which tell the scale best, give that.
 fn alignments(
     set_from_camera: &[Rigid],
     members: &[usize],
@@ -370,11 +374,17 @@ fn alignments(
         .filter_map(|(&photo, &in_set)| Some((in_set, evidence[photo].photo.world_from_camera?)))
         .collect();
     let mut found = Vec::new();
-    for (i, (first_in_set, first_in_world)) in alone.iter().enumerate() {
-        for (j, (second_in_set, second_in_world)) in alone.iter().enumerate() {
-            let baseline = (second_in_set.translation - first_in_set.translation).norm();
+    for (first_in_set, first_in_world) in &alone {
+        let baseline = |(in_set, _): &(Rigid, Rigid)| (in_set.translation - first_in_set.translation).norm();
+        let mut partners: Vec<usize> = (0..alone.len()).collect();
+        partners.sort_by(|&a, &b| baseline(&alone[b]).total_cmp(&baseline(&alone[a])));
+        partners.truncate(SCALING_PARTNERS);
+        partners.sort_unstable();
+        for partner in partners {
+            let (_, second_in_world) = alone[partner];
+            let baseline = baseline(&alone[partner]);
             let scale = (second_in_world.translation - first_in_world.translation).norm() / baseline;
-            if i == j || !(scale > 0.0) || !scale.is_finite() {
+            if !(scale > 0.0) || !scale.is_finite() {
                 continue;
             }
             let rotation = first_in_world.rotation * first_in_set.rotation.inverse();

@@ -19,7 +19,7 @@ use crate::dataset::{
 };
 use crate::error::Hinted;
 use crate::export::{
-    Marker, localizations_json, origin_json, ply, renew_colmap, scene_images_json, top_view_png,
+    Marker, localizations_json, origin_json, ply, renew_colmap, scene_images_json, stated_sigma, top_view_png,
 };
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, Mode, grow, locate};
@@ -85,7 +85,9 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     let unread = located.skipped.iter().find(|skipped| skipped.name == target);
     let why =
         unread.map_or_else(String::new, |skipped| format!(", as it cannot be used: {}", skipped.reason));
-    print::note(&format!("target {target}: {}{why}", verdict.in_words()));
+    let sigma = answer.and_then(|(_, photo)| stated_sigma(photo, &what.scene));
+    let sigma = sigma.map_or_else(String::new, |sigma| format!(", {sigma}"));
+    print::note(&format!("target {target}: {}{sigma}{why}", verdict.in_words()));
     let grown = match &args.grow {
         Some(output) => write_grown((output, &book), &session, &photos, &what, (&target, &located))?,
         None => true,

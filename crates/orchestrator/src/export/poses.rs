@@ -92,11 +92,30 @@ fn sigma_json(rotation_rad: f64, position: f64) -> Value {
 
 /// The same of a covariance: rotation in radians, then centre.
 fn covariance_sigma_json(covariance: &Matrix6<f64>) -> Value {
+    let (rotation_rad, position) = sigma_of(covariance);
+    sigma_json(rotation_rad, position)
+}
+
+/// One sigma of all directions together: of the rotation in radians and of the centre in scene units.
+fn sigma_of(covariance: &Matrix6<f64>) -> (f64, f64) {
     let spread = |from: usize| {
         let variances = (from..from + 3).map(|at| covariance[(at, at)]);
         variances.sum::<f64>().max(0.0).sqrt()
     };
-    sigma_json(spread(0), spread(3))
+    (spread(0), spread(3))
+}
+
+/// What is stated of how far a photo may be off, in words; `None` without a pose.
+pub fn stated_sigma(photo: &PhotoLocalization, scene: &SceneFile) -> Option<String> {
+    let (rotation_rad, position) = sigma_of(photo.covariance.as_ref()?);
+    let unit = if scene.is_placed(photo.component) { "m" } else { "of the scene's units" };
+    let (digits, rotation_deg) = (decimals(position), rotation_rad.to_degrees());
+    Some(format!("one sigma {position:.digits$} {unit} and {rotation_deg:.3}°"))
+}
+
+/// Decimals that show two digits of a small number.
+fn decimals(value: f64) -> usize {
+    if value > 0.0 && value.is_finite() { (1.0 - value.log10().floor()).clamp(0.0, 9.0) as usize } else { 3 }
 }
 
 fn observations_of(model: &setloc_sfm::Reconstruction) -> Vec<usize> {
