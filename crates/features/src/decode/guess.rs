@@ -47,8 +47,8 @@ impl std::fmt::Display for CameraSource {
 
 /// The most likely camera of an image that nobody described, and why.
 ///
-/// In this order: GPano metadata or a 2:1 image without a photo's focal length give `EQUIRECTANGULAR`; EXIF's 35 mm
-/// focal length, then focal length and sensor resolution, then 1.2 times the longer side give `RADIAL`.
+/// In this order: GPano metadata or a 2:1 image without a photo's focal length, of which GPano states no other projection,
+/// give `EQUIRECTANGULAR`; EXIF's 35 mm focal length, then focal length and sensor resolution, then 1.2 times the longer side give `RADIAL`.
 /// Senseless entries are passed over, so there is always an answer.
 pub fn guess_camera(info: &ImageInfo) -> (Camera, CameraSource) {
     let (width, height) = (f64::from(info.width), f64::from(info.height));
@@ -57,7 +57,8 @@ pub fn guess_camera(info: &ImageInfo) -> (Camera, CameraSource) {
         return (panorama(info, gpano), CameraSource::GPano);
     }
     let has_photo_focal = metadata.focal_35mm.is_some_and(|focal| focal > MAX_PANORAMA_FOCAL_35MM);
-    if is_two_to_one(width, height) && !has_photo_focal {
+    let is_other = has_photo_focal || metadata.other_projection.is_some();
+    if is_two_to_one(width, height) && !is_other {
         return (Camera::equirectangular(info.width, info.height), CameraSource::AspectRatio);
     }
     let longer = width.max(height);

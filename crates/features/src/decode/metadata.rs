@@ -1,9 +1,13 @@
+use std::borrow::Cow;
 use std::io::Cursor;
 
 use exif::{Exif, In, Tag, Value};
 use serde::{Deserialize, Serialize};
 
 use super::jpeg;
+
+/// So many characters of a stated projection are kept.
+const LONGEST_PROJECTION: usize = 40;
 
 /// A position on the WGS84 ellipsoid.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -62,6 +66,8 @@ pub struct ImageMetadata {
     pub gps: Option<GeoPosition>,
     /// Photo Sphere metadata, if the image says that it is an equirectangular panorama.
     pub gpano: Option<GPano>,
+    /// The projection that Photo Sphere metadata state, if it is another than the equirectangular one.
+    pub other_projection: Option<String>,
 }
 
 impl Default for ImageMetadata {
@@ -76,6 +82,7 @@ impl Default for ImageMetadata {
             model: None,
             gps: None,
             gpano: None,
+            other_projection: None,
         }
     }
 }
@@ -85,7 +92,11 @@ impl ImageMetadata {
     ///
     /// Tolerant: what is missing, damaged or senseless (a focal length of 0, a latitude of 200°) is left out.
     pub fn read(bytes: &[u8]) -> Self {
-        let mut metadata = Self { gpano: read_gpano(bytes), ..Self::default() };
+        let mut metadata = Self::default();
+        if let Some(packet) = gpano_packet(bytes) {
+            metadata.other_projection = other_projection(&packet);
+            metadata.gpano = metadata.other_projection.is_none().then(|| read_gpano(&packet));
+        }
         let mut reader = exif::Reader::new();
         reader.continue_on_error(true);
         let exif = reader
@@ -149,8 +160,8 @@ fn read_gps(exif: &Exif) -> Option<GeoPosition> {
     plausible.then_some(GeoPosition { lat_deg, lon_deg, alt_m })
 }
 
-/// Scans the XMP packet for GPano properties, written as attributes or as elements.
-fn read_gpano(bytes: &[u8]) -> Option<GPano> {
+/// The XMP packet that has GPano properties.
+fn gpano_packet(bytes: &[u8]) -> Option<Cow<'_, str>> {
     let packets: Vec<&[u8]> = if bytes.starts_with(&[0xFF, 0xD8]) {
         jpeg::app1_segments(bytes)
             .into_iter()
@@ -162,13 +173,21 @@ fn read_gpano(bytes: &[u8]) -> Option<GPano> {
         vec![&bytes[begin..begin + end]]
     };
     let packet = packets.into_iter().find(|packet| find(packet, b"GPano:").is_some())?;
-    let packet = String::from_utf8_lossy(packet);
-    if property(&packet, "ProjectionType").is_some_and(|kind| !kind.eq_ignore_ascii_case("equirectangular")) {
-        return None;
-    }
-    let value = |name| property(&packet, name)?.parse().ok().filter(|value: &f64| value.is_finite());
+    Some(String::from_utf8_lossy(packet))
+}
+
+fn other_projection(packet: &str) -> Option<String> {
+    let stated = property(packet, "ProjectionType")?;
+    // It is shown on a terminal.
+    let shown = || stated.chars().filter(|c| !c.is_control()).take(LONGEST_PROJECTION).collect();
+    (!stated.eq_ignore_ascii_case("equirectangular")).then(shown)
+}
+
+/// Reads GPano properties, written as attributes or as elements.
+fn read_gpano(packet: &str) -> GPano {
+    let value = |name| property(packet, name)?.parse().ok().filter(|value: &f64| value.is_finite());
     let length = |name| value(name).filter(|value| *value > 0.0);
-    Some(GPano {
+    GPano {
         full_width: length("FullPanoWidthPixels"),
         full_height: length("FullPanoHeightPixels"),
         cropped_width: length("CroppedAreaImageWidthPixels"),
@@ -178,7 +197,7 @@ fn read_gpano(bytes: &[u8]) -> Option<GPano> {
         heading_deg: value("PoseHeadingDegrees"),
         pitch_deg: value("PosePitchDegrees"),
         roll_deg: value("PoseRollDegrees"),
-    })
+    }
 }
 
 /// `GPano:Name="value"`, `GPano:Name='value'` or `<GPano:Name>value</GPano:Name>`.

@@ -309,9 +309,24 @@ fn exif_focal_length_and_position_are_read() {
     assert_eq!(zero.focal_35mm, None);
 }
 
-fn gpano(text: &str) -> Option<GPano> {
+fn with_xmp(text: &str) -> ImageMetadata {
     let packet = [b"http://ns.adobe.com/xap/1.0/\0".as_slice(), text.as_bytes()].concat();
-    ImageMetadata::read(&with_app1(&encode(ImageFormat::Jpeg, 16, 16), &packet)).gpano
+    ImageMetadata::read(&with_app1(&encode(ImageFormat::Jpeg, 16, 16), &packet))
+}
+
+fn gpano(text: &str) -> Option<GPano> {
+    with_xmp(text).gpano
+}
+
+#[test]
+fn what_gpano_says_to_be_of_another_projection_is_no_panorama_by_its_shape() {
+    let metadata = with_xmp("GPano:ProjectionType=\"cylin\ndrical\" GPano:FullPanoWidthPixels=\"1536\"");
+    assert_eq!((metadata.gpano, metadata.other_projection.as_deref()), (None, Some("cylindrical")));
+    let (camera, source) = guess_camera(&ImageInfo { width: 1536, height: 768, metadata });
+    assert_eq!((camera.is_panoramic(), source), (false, CameraSource::Fallback));
+    assert_eq!(with_xmp("GPano:ProjectionType='Equirectangular'").other_projection, None);
+    let endless = format!("GPano:ProjectionType=\"{}\"", "x".repeat(1000));
+    assert_eq!(with_xmp(&endless).other_projection.map(|kind| kind.len()), Some(40));
 }
 
 #[test]

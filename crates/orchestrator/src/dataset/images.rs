@@ -29,6 +29,8 @@ pub struct SourceImage {
     pub calibration: Calibration,
     /// Where the camera comes from.
     pub camera_origin: CameraOrigin,
+    /// The projection that the image says to have, if no camera model is of it.
+    pub other_projection: Option<String>,
     /// Measured position.
     pub position: Option<GeoPosition>,
     /// Mask image.
@@ -48,6 +50,7 @@ impl SourceImage {
             camera,
             calibration: Calibration::Guessed,
             camera_origin: CameraOrigin::Listed,
+            other_projection: None,
             position: None,
             mask: None,
             second_look: false,
@@ -292,6 +295,7 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
         camera,
         calibration,
         camera_origin,
+        other_projection: info.metadata.other_projection,
         position,
         mask: None,
         second_look: false,

@@ -80,6 +80,8 @@ pub(super) fn warnings_of(images: &[SourceImage], given: &Given<'_>) -> Vec<Stri
         cameras_without_image(images, given.cameras),
         contradicted_cameras(images, given.cameras),
         guessed_cameras(images),
+        other_projections(images),
+        wide_photos(images),
         positions_without_image(images, given.geo, given.table),
         masks_without_image(images, given.masks),
         masks_of_another_shape(images),
@@ -138,6 +140,42 @@ fn guessed_cameras(images: &[SourceImage]) -> Option<String> {
     let guessed: Vec<String> = guessed.map(|image| image.name.clone()).collect();
     let message = "focal length unknown, 1.2 times the longer side assumed (--cameras gives known ones)";
     (!guessed.is_empty()).then(|| format!("{message}: {}", some_of(&guessed, "photos")))
+}
+
+/// Images whose cameras nobody told and that are not taken for panoramas.
+fn guessed_photos(images: &[SourceImage]) -> impl Iterator<Item = &SourceImage> {
+    let is_guess = |image: &&SourceImage| matches!(image.camera_origin, CameraOrigin::Guessed(_));
+    images.iter().filter(is_guess).filter(|image| !image.camera.is_panoramic())
+}
+
+fn other_projections(images: &[SourceImage]) -> Option<String> {
+    let stated = |image: &SourceImage| Some(format!("{} is {}", image.name, image.other_projection.as_ref()?));
+    let stated: Vec<String> = guessed_photos(images).filter_map(stated).collect();
+    let message = "GPano states other projections than the equirectangular one, and the images are taken as photos, wrong \
+                   if they are none (make equirectangular panoramas of them, or leave them out)";
+    (!stated.is_empty()).then(|| format!("{message}: {}", some_of(&stated, "images")))
+}
+
+/// Ratio of sides above which hardly any image is a photo.
+const WIDEST_PHOTO: f64 = 2.2;
+
+/// Panoramas cut above and below, of which nothing shows how much is missing where.
+fn wide_photos(images: &[SourceImage]) -> Option<String> {
+    let is_wide = |image: &&SourceImage| {
+        f64::from(image.camera.width) > WIDEST_PHOTO * f64::from(image.camera.height)
+            && image.other_projection.is_none()
+    };
+    let wide: Vec<&SourceImage> = guessed_photos(images).filter(is_wide).collect();
+    let Camera { width, height, .. } = wide.first()?.camera;
+    let names: Vec<String> = wide.iter().map(|image| image.name.clone()).collect();
+    let (sphere, cut) = (width / 2, (width / 2).saturating_sub(height) / 2);
+    Some(format!(
+        "wider than {WIDEST_PHOTO}:1 and taken as photos: {} (of panoramas that are cut, --cameras has to tell what is \
+         missing: {{\"model\": \"EQUIRECTANGULAR\", \"width\": {width}, \"height\": {height}, \"params\": [w, h, left, top]}}, \
+         size of the whole sphere, and its first column and row that are there; all round, with the horizon in the middle, \
+         [{width}, {sphere}, 0, {cut}])",
+        some_of(&names, "images")
+    ))
 }
 
 fn masks_without_image(images: &[SourceImage], masks: Option<&Path>) -> Option<String> {
@@ -238,6 +276,42 @@ mod tests {
         );
         assert_eq!(read.warnings.len(), 1, "{:?}", read.warnings);
         assert!(read.warnings[0].ends_with("(--cameras gives known ones): p/d.png"), "{:?}", read.warnings);
+    }
+
+    #[test]
+    fn panoramas_that_are_cut_are_said_to_need_a_camera() {
+        let folder = Folder::of(&[("a.png", 440, 200), ("b.png", 460, 140), ("c.png", 460, 141)]);
+        let said = |read: &ImageFolder| {
+            let wide = read.warnings.iter().filter(|warning| warning.starts_with("wider than 2.2:1"));
+            wide.cloned().collect::<Vec<String>>()
+        };
+        let alone = said(&folder.read_alone());
+        assert!(alone[0].contains("taken as photos: p/b.png; p/c.png (") && alone.len() == 1, "{alone:?}");
+        let remedy = "\"EQUIRECTANGULAR\", \"width\": 460, \"height\": 140, \"params\": [w, h, left, top]}";
+        assert!(alone[0].contains(remedy) && alone[0].ends_with("[460, 230, 0, 45])"), "{alone:?}");
+        let told = r#"{"cameras": {
+            "b": {"model": "EQUIRECTANGULAR", "width": 460, "height": 140, "params": [460, 230, 0, 45]},
+            "c": {"model": "SIMPLE_PINHOLE", "width": 460, "height": 141, "params": [400, 230, 70]}},
+            "images": {"b.png": "b", "c.png": "c"}}"#;
+        let book = CameraBook::read(&folder.write("cameras.json", told)).unwrap();
+        assert!(said(&folder.read(&book, &GeoSource::None, None)).is_empty());
+    }
+
+    #[test]
+    fn other_projections_are_named() {
+        let camera = Camera::from_focal_guess(64, 32, 77.0);
+        let image = |name: &str, other: Option<&str>, camera_origin| SourceImage {
+            camera_origin,
+            other_projection: other.map(str::to_owned),
+            ..SourceImage::guessed(name, camera.clone())
+        };
+        let images = [
+            image("a", Some("cylindrical"), FALLBACK),
+            image("b", None, FALLBACK),
+            image("c", Some("cylindrical"), CameraOrigin::Listed),
+        ];
+        assert!(other_projections(&images).unwrap().ends_with(": a is cylindrical"));
+        assert_eq!(other_projections(&images[1..]), None);
     }
 
     #[test]

@@ -311,6 +311,7 @@ mod tests {
             camera: Camera::equirectangular(20, 10),
             calibration: Calibration::Known,
             camera_origin: CameraOrigin::Listed,
+            other_projection: None,
             position: Some(GeoPosition { lat_deg, lon_deg, alt_m }),
             mask: None,
             second_look: false,
