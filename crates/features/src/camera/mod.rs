@@ -5,6 +5,7 @@ mod lens;
 mod model;
 mod newton;
 mod paper_rectilinear;
+mod plausible;
 mod stitched;
 #[cfg(test)]
 mod tests;

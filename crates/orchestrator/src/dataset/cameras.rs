@@ -6,6 +6,7 @@ use serde::Deserialize;
 use setloc_features::Camera;
 
 use super::find_by_name;
+use crate::error::Hinted;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -28,14 +29,20 @@ impl CameraBook {
     /// Reads a `cameras.json`.
     ///
     /// # Errors
-    /// With file, line and key, when it is not one or a camera is not usable.
+    /// With file, line and key, when it is not one or a camera is not usable or cannot be that of its image.
     pub fn read(path: &Path) -> Result<Self> {
         let shown = path.display();
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {shown}"))?;
         let file: CamerasFile =
             serde_json::from_str(&text).with_context(|| format!("{shown} is no cameras.json"))?;
         for (name, camera) in &file.cameras {
-            camera.validate().with_context(|| format!("{shown}: camera `{name}`"))?;
+            let checked = camera.validate().and_then(|()| camera.check_plausible());
+            checked.with_context(|| format!("{shown}: camera `{name}`")).map_err(|error| {
+                let params = camera.model.param_names().join(", ");
+                let size = format!("{} × {}", camera.width, camera.height);
+                let hint = format!("its params are {params}, in pixels of an image of {size} that begins at (0, 0)");
+                Hinted::wrap(error, hint)
+            })?;
         }
         let mut by_image = BTreeMap::new();
         for (image, name) in file.images {
@@ -57,5 +64,31 @@ impl CameraBook {
     /// The first image that the file names.
     pub(super) fn first_name(&self) -> Option<&str> {
         self.by_image.keys().next().map(String::as_str)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(camera: &str) -> Result<CameraBook> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cameras.json");
+        let images = r#"{"a.jpg": "lens"}"#;
+        std::fs::write(&path, format!(r#"{{"cameras": {{"lens": {camera}}}, "images": {images}}}"#)).unwrap();
+        CameraBook::read(&path)
+    }
+
+    #[test]
+    fn cameras_that_no_image_has_are_named_with_file_value_and_remedy() {
+        let pinhole = |params: &str| {
+            read(&format!(r#"{{"model": "PINHOLE", "width": 1024, "height": 768, "params": [{params}]}}"#))
+        };
+        assert!(pinhole("760, 760, 512, 384").is_ok());
+        let error = pinhole("760, 760, 5120, 3840").unwrap_err();
+        let said = format!("{error:#}");
+        assert!(said.contains("cameras.json: camera `lens`") && said.contains("(5120, 3840)"), "{said}");
+        let hint = error.downcast_ref::<Hinted>().unwrap().hint();
+        assert_eq!(hint, "its params are fx, fy, cx, cy, in pixels of an image of 1024 × 768 that begins at (0, 0)");
     }
 }

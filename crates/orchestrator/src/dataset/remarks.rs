@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use setloc_features::{Camera, CameraSource};
+use setloc_features::{Camera, CameraModel, CameraSource};
 
 use super::{CameraBook, CameraOrigin, GeoBook, GeoSource, ImageFolder, SourceImage};
 use crate::fingerprint::ContentHash;
@@ -79,6 +79,8 @@ pub(super) fn warnings_of(images: &[SourceImage], given: &Given<'_>) -> Vec<Stri
     let warnings = [
         cameras_without_image(images, given.cameras),
         contradicted_cameras(images, given.cameras),
+        principal_points_aside(images),
+        images_without_rays(images),
         guessed_cameras(images),
         other_projections(images),
         wide_photos(images),
@@ -133,6 +135,38 @@ fn contradicted_cameras(images: &[SourceImage], cameras: &CameraBook) -> Option<
         .collect();
     let not_used = format!("{}: cameras of another size than their images are not used", file.display());
     (!contradicted.is_empty()).then(|| format!("{not_used}: {}", some_of(&contradicted, "images")))
+}
+
+/// Images whose cameras `cameras.json` tells.
+fn listed_cameras(images: &[SourceImage]) -> impl Iterator<Item = &SourceImage> {
+    images.iter().filter(|image| image.camera_origin == CameraOrigin::Listed)
+}
+
+fn principal_points_aside(images: &[SourceImage]) -> Option<String> {
+    let aside = |image: &SourceImage| {
+        let center = image.camera.principal_point_aside()?;
+        let (width, height) = (image.camera.width, image.camera.height);
+        Some(format!("{}, {width}×{height}, has ({}, {})", image.name, center.x, center.y))
+    };
+    let aside: Vec<String> = listed_cameras(images).filter_map(aside).collect();
+    let message = "principal points outside of their images, as only crops have them";
+    (!aside.is_empty()).then(|| format!("{message}: {}", some_of(&aside, "images")))
+}
+
+/// The share of an image without rays that goes unsaid.
+const WITHOUT_RAYS: f64 = 0.01;
+
+/// Fisheyes show nothing in corners that have no rays; other lenses do.
+fn images_without_rays(images: &[SourceImage]) -> Option<String> {
+    let without = |image: &SourceImage| {
+        let is_fisheye =
+            matches!(image.camera.model, CameraModel::SimpleFisheye | CameraModel::OpencvFisheye);
+        let share = 1.0 - image.camera.share_with_rays();
+        (!is_fisheye && share > WITHOUT_RAYS).then(|| format!("{} {:.0} %", image.name, 100.0 * share))
+    };
+    let without: Vec<String> = listed_cameras(images).filter_map(without).collect();
+    let message = "told distortion leaves parts of images without rays, where nothing is used";
+    (!without.is_empty()).then(|| format!("{message}: {}", some_of(&without, "images")))
 }
 
 fn guessed_cameras(images: &[SourceImage]) -> Option<String> {
@@ -295,6 +329,24 @@ mod tests {
             "images": {"b.png": "b", "c.png": "c"}}"#;
         let book = CameraBook::read(&folder.write("cameras.json", told)).unwrap();
         assert!(said(&folder.read(&book, &GeoSource::None, None)).is_empty());
+    }
+
+    #[test]
+    fn told_cameras_that_are_odd_are_said() {
+        let image = |name: &str, params: &[f64]| SourceImage {
+            camera_origin: CameraOrigin::Listed,
+            ..SourceImage::guessed(
+                name,
+                Camera { params: params.to_vec(), ..Camera::from_focal_guess(300, 200, 1.0) },
+            )
+        };
+        let usual = image("a", &[300.0, 150.0, 100.0, -0.1, 0.0]);
+        let crop = image("b", &[900.0, -40.5, 100.0, 0.0, 0.0]);
+        let folded = image("c", &[300.0, 150.0, 100.0, -0.5, 0.0]);
+        let images = [usual, crop, folded];
+        assert!(principal_points_aside(&images).unwrap().ends_with(": b, 300×200, has (-40.5, 100)"));
+        assert!(images_without_rays(&images).unwrap().contains("where nothing is used: c "));
+        assert_eq!((principal_points_aside(&images[..1]), images_without_rays(&images[..1])), (None, None));
     }
 
     #[test]
