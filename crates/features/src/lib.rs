@@ -64,7 +64,7 @@ pub use camera::{
 };
 pub use decode::{
     CameraSource, DecodeLimits, DecodedImage, GPano, GeoPosition, ImageInfo, ImageMetadata, decode,
-    decode_grey, fallback_camera, guess_camera, probe,
+    decode_grey, fallback_camera, guess_camera, probe, upright_camera,
 };
 pub use error::FeatureError;
 pub use extract::{FeatureParams, extract, extract_simulated_views, keypoint_noise_px};

@@ -8,7 +8,7 @@ use setloc_town::TownParams;
 pub use setloc_features::{
     DecodeLimits, DecodedImage, FeatureParams, ImageInfo, ImagePyramid, Mask, MatchParams, Posture, decode,
     decode_grey, extract, extract_simulated_views, guess_camera, match_features, match_simulated_views,
-    probe,
+    probe, upright_camera,
 };
 
 /// Version of decoding and extraction; part of the fingerprint of `features` jobs.

@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use crate::{FeatureError, GreyImage};
 pub use guess::{CameraSource, fallback_camera, guess_camera};
 pub use metadata::{GPano, GeoPosition, ImageMetadata};
+pub use orientation::upright_camera;
 
 /// Limits on images, checked on the header before any pixel is allocated.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

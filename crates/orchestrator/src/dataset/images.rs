@@ -276,10 +276,9 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
     let bytes = std::fs::read(path)?;
     anyhow::ensure!(!bytes.is_empty(), "the file is empty");
     let info = stages::probe(&bytes, &stages::DecodeLimits::default()).context("not a readable image")?;
-    let known =
-        cameras.find(name, path).filter(|camera| (camera.width, camera.height) == (info.width, info.height));
+    let known = cameras.find(name, path).and_then(|camera| camera_of(&info, camera));
     let (camera, calibration, camera_origin) = if let Some(camera) = known {
-        (camera.clone(), Calibration::Known, CameraOrigin::Listed)
+        (camera, Calibration::Known, CameraOrigin::Listed)
     } else {
         let (camera, source) = stages::guess_camera(&info);
         let calibration = if camera.is_panoramic() { Calibration::Known } else { Calibration::Guessed };
@@ -300,6 +299,18 @@ fn read_image(name: &str, path: &Path, cameras: &CameraBook, geo: &GeoSource) ->
         mask: None,
         second_look: false,
     })
+}
+
+/// The told camera of an image; one of the pixels as they are stored, as COLMAP's are, is turned upright with them. `None` when
+/// it is of another size.
+///
+/// Where both have the same size, a camera is of the upright image.
+fn camera_of(info: &stages::ImageInfo, told: &Camera) -> Option<Camera> {
+    let fits = |camera: &Camera| (camera.width, camera.height) == (info.width, info.height);
+    if fits(told) {
+        return Some(told.clone());
+    }
+    stages::upright_camera(info.metadata.orientation, told).filter(fits)
 }
 
 /// `<folder>/<file>.png`, as COLMAP names masks, or `<folder>/<stem>.png`.
@@ -378,6 +389,25 @@ mod tests {
             read.images.iter().all(|image| image.camera == camera && image.calibration == Calibration::Known)
         );
         assert!(read.warnings.is_empty(), "{:?}", read.warnings);
+    }
+
+    #[test]
+    fn told_cameras_are_of_the_upright_image_or_of_the_stored_pixels() {
+        let camera = |width, height, cx: f64, cy: f64| {
+            let params = vec![700.0, cx, cy, -0.1, 0.0];
+            Camera { params, ..Camera::from_focal_guess(width, height, 1.0) }
+        };
+        let info = |orientation| {
+            let metadata = setloc_features::ImageMetadata { orientation, ..Default::default() };
+            stages::ImageInfo { width: 300, height: 400, metadata }
+        };
+        let (upright, stored) = (camera(300, 400, 140.0, 210.0), camera(400, 300, 210.0, 160.0));
+        assert_eq!(camera_of(&info(6), &upright), Some(upright.clone()));
+        assert_eq!(camera_of(&info(6), &stored), Some(upright.clone()));
+        assert_eq!(camera_of(&info(8), &stored), Some(camera(300, 400, 160.0, 190.0)));
+        assert_eq!(camera_of(&info(3), &upright), Some(upright));
+        assert_eq!(camera_of(&info(1), &stored), None);
+        assert_eq!(camera_of(&info(6), &camera(800, 600, 400.0, 300.0)), None);
     }
 
     #[test]

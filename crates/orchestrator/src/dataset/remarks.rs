@@ -126,11 +126,11 @@ fn contradicted_cameras(images: &[SourceImage], cameras: &CameraBook) -> Option<
     let file = cameras.file.as_deref()?;
     let contradicted: Vec<String> = images
         .iter()
+        .filter(|image| image.camera_origin != CameraOrigin::Listed)
         .filter_map(|image| {
             let (given, actual) = (cameras.find(&image.name, &image.path)?, &image.camera);
-            let differs = (given.width, given.height) != (actual.width, actual.height);
             let [given, actual] = [given, actual].map(|camera| format!("{}×{}", camera.width, camera.height));
-            differs.then(|| format!("{} is {actual}, its camera {given}", image.name))
+            Some(format!("{} is {actual}, its camera {given}", image.name))
         })
         .collect();
     let not_used = format!("{}: cameras of another size than their images are not used", file.display());
