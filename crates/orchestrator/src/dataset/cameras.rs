@@ -40,7 +40,8 @@ impl CameraBook {
             checked.with_context(|| format!("{shown}: camera `{name}`")).map_err(|error| {
                 let params = camera.model.param_names().join(", ");
                 let size = format!("{} × {}", camera.width, camera.height);
-                let hint = format!("its params are {params}, in pixels of an image of {size} that begins at (0, 0)");
+                let hint =
+                    format!("its params are {params}, in pixels of an image of {size} that begins at (0, 0)");
                 Hinted::wrap(error, hint)
             })?;
         }
@@ -58,7 +59,12 @@ impl CameraBook {
 
     /// The camera of an image, if the file names it.
     pub fn find(&self, name: &str, path: &Path) -> Option<&Camera> {
-        find_by_name(&self.by_image, name, path)
+        Some(find_by_name(&self.by_image, name, path)?.1)
+    }
+
+    /// What an image is called in the file, if it names it.
+    pub(super) fn listed_name(&self, name: &str, path: &Path) -> Option<&str> {
+        Some(find_by_name(&self.by_image, name, path)?.0)
     }
 
     /// The first image that the file names.
@@ -89,6 +95,9 @@ mod tests {
         let said = format!("{error:#}");
         assert!(said.contains("cameras.json: camera `lens`") && said.contains("(5120, 3840)"), "{said}");
         let hint = error.downcast_ref::<Hinted>().unwrap().hint();
-        assert_eq!(hint, "its params are fx, fy, cx, cy, in pixels of an image of 1024 × 768 that begins at (0, 0)");
+        assert_eq!(
+            hint,
+            "its params are fx, fy, cx, cy, in pixels of an image of 1024 × 768 that begins at (0, 0)"
+        );
     }
 }

@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use setloc_features::GeoPosition;
 
-use super::find_by_name;
+use super::{SourceImage, find_by_name, shared};
 use crate::error::Hinted;
+use crate::text::some_of;
 
 /// Where measured positions come from.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -21,6 +22,8 @@ pub enum GeoSource {
 /// Measured positions by image.
 #[derive(Debug, Clone, Default)]
 pub struct GeoBook {
+    /// Where they were read from.
+    file: PathBuf,
     by_image: BTreeMap<String, GeoPosition>,
 }
 
@@ -81,7 +84,8 @@ impl GeoBook {
         // Spreadsheet programs put a byte order mark before the first name.
         let text = text.trim_start_matches('\u{feff}');
         let mut columns = None;
-        let mut by_image = BTreeMap::new();
+        let mut by_image: BTreeMap<String, GeoPosition> = BTreeMap::new();
+        let mut line_of = BTreeMap::new();
         for (at, line) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
             let fields: Vec<&str> = line.split(',').map(|field| unquoted(field.trim())).collect();
             let wrong = |what: &str| {
@@ -101,14 +105,35 @@ impl GeoBook {
             columns = Some(known);
             let (name, place) =
                 known.read(&fields).ok_or_else(|| wrong(&format!("`{line}` is no position")))?;
+            let first = *line_of.entry(name.clone()).or_insert(at + 1);
+            if by_image.get(&name).is_some_and(|before| *before != place) {
+                let message = format!("{shown}: lines {first} and {} place `{name}` differently", at + 1);
+                return Err(Hinted::error(message, "leave one of them, or name the folders of two images"));
+            }
             by_image.insert(name, place);
         }
-        Ok(Self { by_image })
+        Ok(Self { file: path.to_owned(), by_image })
+    }
+
+    /// Checks that no line places several images.
+    ///
+    /// # Errors
+    /// With the file, the line's name and the images.
+    pub(super) fn check_one_image_each(&self, images: &[SourceImage]) -> Result<()> {
+        let listed = |image: &SourceImage| Some(find_by_name(&self.by_image, &image.name, &image.path)?.0);
+        let Some((name, images)) = shared(images, listed).into_iter().next() else { return Ok(()) };
+        let message = format!(
+            "{}: `{name}` names {} images, which cannot be in one place: {}",
+            self.file.display(),
+            images.len(),
+            some_of(&images, "images")
+        );
+        Err(Hinted::error(message, format!("name their folders as well, as `{}`", images[0])))
     }
 
     /// The position of an image, if the table names it.
     pub fn find(&self, name: &str, path: &Path) -> Option<GeoPosition> {
-        find_by_name(&self.by_image, name, path).copied()
+        Some(*find_by_name(&self.by_image, name, path)?.1)
     }
 
     /// The first image that the table names.
@@ -148,6 +173,13 @@ mod tests {
         let book = read("a.png,47.25,8.5,400\nb.png,47.5,8.5\n").unwrap();
         assert_eq!(place(&book, "a.png"), (47.25, 8.5, Some(400.0)));
         assert_eq!(place(&book, "b.png"), (47.5, 8.5, None));
+    }
+
+    #[test]
+    fn an_image_that_is_placed_twice_is_an_error_with_its_lines() {
+        let error = read("name,lat,lon\na.png,47,8\nb.png,47,8\na.png,47.5,8\n").unwrap_err();
+        assert!(error.to_string().ends_with("geo.csv: lines 2 and 4 place `a.png` differently"), "{error}");
+        assert!(read("a.png,47,8\na.png,47,8\n").is_ok());
     }
 
     #[test]

@@ -267,6 +267,7 @@ impl ImageFolder {
                 format!("none of {} files is a readable image ({})", files.len(), reasons.join("; "));
             return Err(Hinted::error(message, "check the files with an image viewer"));
         }
+        table.check_one_image_each(&folder.images)?;
         folder.warnings = warnings_of(&folder.images, &Given { cameras, geo, table: &table, masks });
         Ok(folder)
     }
@@ -388,7 +389,16 @@ mod tests {
         assert!(
             read.images.iter().all(|image| image.camera == camera && image.calibration == Calibration::Known)
         );
-        assert!(read.warnings.is_empty(), "{:?}", read.warnings);
+        let shared =
+            "`panoramas/0.png` names 3 images, which are told the same camera: day1/panoramas/0.png; ";
+        assert!(read.warnings.len() == 1 && read.warnings[0].contains(shared), "{:?}", read.warnings);
+        // What names a folder that two of them have places neither.
+        std::fs::write(root.path().join("geo.csv"), "panoramas/0.png,1,8\n").unwrap();
+        let table = GeoSource::Table(root.path().join("geo.csv"));
+        let error = ImageFolder::read(&list_images(&days).unwrap(), &book, &table, None).unwrap_err();
+        let said =
+            "geo.csv: `panoramas/0.png` names 3 images, which cannot be in one place: day1/panoramas/0.png; ";
+        assert!(error.to_string().contains(said), "{error}");
     }
 
     #[test]

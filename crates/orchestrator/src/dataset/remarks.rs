@@ -3,7 +3,7 @@ use std::path::Path;
 
 use setloc_features::{Camera, CameraModel, CameraSource};
 
-use super::{CameraBook, CameraOrigin, GeoBook, GeoSource, ImageFolder, SourceImage};
+use super::{CameraBook, CameraOrigin, GeoBook, GeoSource, ImageFolder, SourceImage, shared};
 use crate::fingerprint::ContentHash;
 use crate::stages;
 use crate::text::some_of;
@@ -79,6 +79,7 @@ pub(super) fn warnings_of(images: &[SourceImage], given: &Given<'_>) -> Vec<Stri
     let warnings = [
         cameras_without_image(images, given.cameras),
         contradicted_cameras(images, given.cameras),
+        shared_cameras(images, given.cameras),
         principal_points_aside(images),
         images_without_rays(images),
         guessed_cameras(images),
@@ -87,6 +88,7 @@ pub(super) fn warnings_of(images: &[SourceImage], given: &Given<'_>) -> Vec<Stri
         positions_without_image(images, given.geo, given.table),
         masks_without_image(images, given.masks),
         masks_of_another_shape(images),
+        shared_masks(images),
         equal_images(images),
     ];
     warnings.into_iter().flatten().collect()
@@ -137,6 +139,27 @@ fn contradicted_cameras(images: &[SourceImage], cameras: &CameraBook) -> Option<
     (!contradicted.is_empty()).then(|| format!("{not_used}: {}", some_of(&contradicted, "images")))
 }
 
+/// One name that several images have is meant so where they are of one camera, and a mistake where they are not.
+fn shared_cameras(images: &[SourceImage], cameras: &CameraBook) -> Option<String> {
+    let file = cameras.file.as_deref()?;
+    let shared = shared(images, |image| cameras.listed_name(&image.name, &image.path));
+    let line = |(name, images): &(&str, Vec<String>)| {
+        let (count, some) = (images.len(), some_of(images, "images"));
+        format!("`{name}` names {count} images, which are told the same camera: {some}")
+    };
+    let lines: Vec<String> = shared.iter().map(line).collect();
+    (!lines.is_empty()).then(|| format!("{}: {}", file.display(), some_of(&lines, "names")))
+}
+
+fn shared_masks(images: &[SourceImage]) -> Option<String> {
+    let shared = shared(images, |image| image.mask.as_ref().map(|(path, _)| path.as_path()));
+    let line = |(mask, images): &(&Path, Vec<String>)| {
+        format!("{} is that of {} images: {}", mask.display(), images.len(), some_of(images, "images"))
+    };
+    let lines: Vec<String> = shared.iter().map(line).collect();
+    (!lines.is_empty()).then(|| format!("masks of several images: {}", some_of(&lines, "masks")))
+}
+
 /// Images whose cameras `cameras.json` tells.
 fn listed_cameras(images: &[SourceImage]) -> impl Iterator<Item = &SourceImage> {
     images.iter().filter(|image| image.camera_origin == CameraOrigin::Listed)
@@ -183,7 +206,8 @@ fn guessed_photos(images: &[SourceImage]) -> impl Iterator<Item = &SourceImage> 
 }
 
 fn other_projections(images: &[SourceImage]) -> Option<String> {
-    let stated = |image: &SourceImage| Some(format!("{} is {}", image.name, image.other_projection.as_ref()?));
+    let stated =
+        |image: &SourceImage| Some(format!("{} is {}", image.name, image.other_projection.as_ref()?));
     let stated: Vec<String> = guessed_photos(images).filter_map(stated).collect();
     let message = "GPano states other projections than the equirectangular one, and the images are taken as photos, wrong \
                    if they are none (make equirectangular panoramas of them, or leave them out)";
@@ -406,6 +430,9 @@ mod tests {
         assert!(lost[0].ends_with("that of p/a.png is a.png.png or a.png"), "{lost:?}");
         image::GrayImage::new(64, 32).save(masks.join("a.png")).unwrap();
         assert!(folder.read(&none, &GeoSource::None, Some(&masks)).warnings.is_empty());
+        image::GrayImage::from_pixel(64, 32, image::Luma([9])).save(folder.0.path().join("p/a.bmp")).unwrap();
+        let shared = folder.read(&none, &GeoSource::None, Some(&masks)).warnings;
+        assert!(shared[0].ends_with("masks/a.png is that of 2 images: p/a.bmp; p/a.png"), "{shared:?}");
     }
 
     #[test]
