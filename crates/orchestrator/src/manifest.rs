@@ -50,6 +50,8 @@ pub struct SetEntry {
     pub photos: Vec<PathBuf>,
     /// The photo that matters; the last by name when missing.
     pub target: Option<String>,
+    /// Folder of mask images.
+    pub masks: Option<PathBuf>,
     /// Known intrinsics.
     pub cameras: Option<PathBuf>,
 }
@@ -183,6 +185,15 @@ mod tests {
         assert!(one("\"camset.rato\" = [1]").contains("camset.rato=1"));
         assert!(one("\"camset.ratio\" = [0.6, \"x\"]").contains("camset.ratio=\"x\""));
         assert!(one("\"camset.ratio\" = [0.6, 0.6]").contains("two results"));
+    }
+
+    #[test]
+    fn a_set_may_have_masks_of_its_own() {
+        let scene = "[[scene]]\nname = \"a\"\npanoramas = [\"a\"]\n";
+        let set = "[[scene.sets]]\nname = \"b\"\nphotos = [\"b\"]\nmasks = \"m\"\n";
+        let read = manifest(&format!("{scene}{set}")).unwrap();
+        assert_eq!(read.scene[0].sets[0].masks.as_deref(), Some(Path::new("m")));
+        assert_eq!(read.scene[0].masks, None);
     }
 
     #[test]

@@ -189,6 +189,9 @@ pub struct LocateArgs {
     /// Methods to try
     #[arg(long, value_enum, default_value_t)]
     pub mode: Mode,
+    /// Folder of mask images, named as the photos, in their folders or not; black is left out
+    #[arg(long, value_name = "DIR")]
+    pub masks: Option<PathBuf>,
     /// Known intrinsics
     #[arg(long, value_name = "cameras.json")]
     pub cameras: Option<PathBuf>,

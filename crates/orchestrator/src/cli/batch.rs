@@ -150,6 +150,7 @@ fn locate_args(set: &SetEntry, scene: &Path, folder: &Path, places: &Places<'_>)
         photos: set.photos.iter().map(|path| places.base.join(path)).collect(),
         target: set.target.clone(),
         mode: Mode::Auto,
+        masks: set.masks.as_ref().map(|path| places.base.join(path)),
         cameras: set.cameras.as_ref().map(|path| places.base.join(path)),
         grow: None,
         output: folder.join(&set.name),

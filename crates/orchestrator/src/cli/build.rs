@@ -47,8 +47,7 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     let files = list_sources(&args.source)?;
     refuse_inputs(&args.source, &files, &export)?;
     let mut folder = read_sources(&args.source, &files)?;
-    let masks = folder.images.iter().filter_map(|image| image.mask.as_ref());
-    refuse_input(masks.map(|(path, _)| path.as_path()), output)?;
+    refuse_input(folder.mask_files(), output)?;
     let session = args.source.run.session(output, Some(&export))?;
     let name = session.store.name_of("build", output);
     let present = std::fs::read(output).ok().map(|bytes| ContentHash::of(&bytes));

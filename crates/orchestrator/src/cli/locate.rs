@@ -52,8 +52,12 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     refuse_inputs(args, &files)?;
     let target = find_target(args.target.as_deref(), &files)?;
     let cameras = args.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default();
-    let mut photos = ImageFolder::read(&files, &cameras, &GeoSource::None, None)?;
-    photos.warnings.extend(unread_images(&args.photos, None));
+    let masks = args.masks.as_deref();
+    let mut photos = ImageFolder::read(&files, &cameras, &GeoSource::None, masks)?;
+    photos.warnings.extend(unread_images(&args.photos, masks));
+    if let Some(grown) = &args.grow {
+        refuse_input(photos.mask_files(), grown)?;
+    }
     remark(&photos);
     // Results of photos are kept beside the scene, where those of its images are.
     let session = args.run.session(&args.scene, Some(&args.output))?;

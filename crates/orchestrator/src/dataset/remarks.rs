@@ -24,9 +24,14 @@ impl ImageFolder {
         (!parts.is_empty()).then(|| format!("cameras: {}", parts.join(", ")))
     }
 
+    /// The files of the images' masks.
+    pub fn mask_files(&self) -> impl Iterator<Item = &Path> {
+        self.images.iter().filter_map(|image| Some(image.mask.as_ref()?.0.as_path()))
+    }
+
     /// How many images have masks, where some have.
     pub fn mask_summary(&self) -> Option<String> {
-        let masked = self.images.iter().filter(|image| image.mask.is_some()).count();
+        let masked = self.mask_files().count();
         (masked > 0).then(|| format!("masks: {masked} of {} images", self.images.len()))
     }
 

@@ -72,8 +72,13 @@ fn report_and_status_tell_what_came_out() {
     let cameras = ["--cameras", "town/cameras.json"];
     let build = run(&[&["build", "town/panoramas", "-o", "s.setloc"], &cameras[..]].concat());
     assert_eq!(build.status.code(), Some(0), "{}", said(&build));
-    let locate = run(&[&["locate", "s.setloc", "town/queries/lane", "-o", "out"], &cameras[..]].concat());
+    std::fs::create_dir(folder.path().join("masks")).unwrap();
+    let nothing_left_out = image::GrayImage::from_pixel(4, 3, image::Luma([255]));
+    nothing_left_out.save(folder.path().join("masks/img_03.png")).unwrap();
+    let photos = ["locate", "s.setloc", "town/queries/lane", "-o", "out", "--masks", "masks"];
+    let locate = run(&[&photos, &cameras[..]].concat());
     assert!(matches!(locate.status.code(), Some(0 | 1)), "{}", said(&locate));
+    assert!(said(&locate).contains("masks: 1 of 4 images\n"), "{}", said(&locate));
 
     let of_scene = run(&["report", "s.setloc"]);
     assert_eq!(of_scene.status.code(), Some(0), "{}", said(&of_scene));
