@@ -17,11 +17,9 @@ mod status;
 use std::io::{self, ErrorKind};
 use std::process::ExitCode;
 
-use clap::Parser;
-
 use crate::error::{Hinted, Interrupted};
 use crate::print;
-use args::{Cli, Command};
+use args::Command;
 
 /// What a command came to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,7 +35,7 @@ pub const STOPPED: u8 = 130;
 
 /// Runs the program: exit code 0 done, 1 negative answer, 2 error, 130 stopped.
 pub fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let cli = match args::parse(std::env::args_os()) {
         Ok(cli) => cli,
         Err(error) => error.exit(),
     };

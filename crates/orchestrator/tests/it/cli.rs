@@ -1,6 +1,6 @@
 //! What the program says: help, errors with their hints, reports. `INSTA_UPDATE=always` accepts new texts.
 
-use crate::common::{gave, panoramas, said, setloc, town};
+use crate::common::{gave, panoramas, program, said, setloc, town};
 
 #[test]
 fn help_says_what_there_is() {
@@ -62,6 +62,19 @@ fn errors_name_the_file_the_place_and_the_remedy() {
     insta::with_settings!({ filters => vec![(r"expected one of `.*", "expected one of […]")] }, {
         insta::assert_snapshot!("errors", texts.replace(&here, "[here]"));
     });
+}
+
+#[test]
+fn an_empty_variable_is_none() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    for arguments in [&["plan", "panoramas"][..], &["status"], &["cache", "ls"], &["explain", "features"]] {
+        let plain = setloc(folder.path(), arguments);
+        let empty = program(folder.path(), arguments).env("SETLOC_CACHE", "").output().unwrap();
+        assert_eq!((gave(&empty), said(&empty)), (gave(&plain), said(&plain)), "{arguments:?}");
+    }
+    let typed = program(folder.path(), &["status", "--cache", ""]).output().unwrap();
+    assert_eq!(typed.status.code(), Some(2));
 }
 
 #[test]
