@@ -145,7 +145,7 @@ serde_artifact!(LikelyImages, "likely images", 1);
 serde_artifact!(LeftApart, "images left apart", 1);
 serde_artifact!(VerifiedPair, "verified pair", 1);
 serde_artifact!(TurnedPair, "turned pair", 1);
-serde_artifact!(MapperOutput, "model", 9);
+serde_artifact!(MapperOutput, "model", 10);
 serde_artifact!(SceneIndices, "index", 2);
 serde_artifact!(NearestAnywhere, "nearest scene points", 1);
 serde_artifact!(AnywhereLocalization, "photo localization", 4);

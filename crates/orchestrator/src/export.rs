@@ -14,5 +14,8 @@ pub use geojson::geojson;
 pub use kml::kml;
 pub use nerfstudio::nerfstudio;
 pub use ply::ply;
-pub use poses::{localizations_json, origin_json, pose_json, scene_images_json, scene_json, stated_sigma};
+pub use poses::{
+    localization_json, localizations_json, origin_json, pose_json, scene_images_json, scene_json,
+    stated_sigma,
+};
 pub use top_view::{Marker, top_view_png};

@@ -22,6 +22,7 @@ pub use locate::{LocateJobs, SetJobs, SingleJobs, add_set, add_singles};
 pub use matching::{PairSource, add_turned};
 pub use model::{ModelJobs, ModelKind, add_model, divided_guesses};
 pub use pairs::choose_pairs;
+pub use positions::how_fixed;
 pub use scene::{
     ApartJob, SceneInputs, SceneJobs, SceneModelJobs, add_first_model, add_model_apart, add_scene,
 };

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use setloc_camset::GrownImage;
 use setloc_features::{ImageFeatures, Wgs84};
 use setloc_index::SceneIndex;
-use setloc_sfm::{CorrectedCamera, ImageId, ModelErrors, Reconstruction, Rigid};
+use setloc_sfm::{CorrectedCamera, FrameErrors, ImageId, ModelErrors, Reconstruction, Rigid};
 
 use crate::codec::{self, Artifact};
 use crate::error::Hinted;
@@ -24,6 +24,8 @@ pub struct SceneFile {
     pub indices: Vec<SceneIndex>,
     /// Whether measured positions place each component in the frame of `origin`; if not, its frame is its own.
     pub placed: Vec<bool>,
+    /// What each component may be off in that frame as a whole, where that is told.
+    pub frame_errors: Vec<Option<FrameErrors>>,
     /// Images of each component about which it may be wrong; ascending.
     pub doubtful: Vec<Vec<ImageId>>,
     /// Cameras whose told intrinsics the images contradict; photos of the same camera are contradicted with them.
@@ -50,7 +52,7 @@ pub struct SceneFile {
     pub content: ContentHash,
 }
 
-serde_artifact!(SceneFile, "scene", 17);
+serde_artifact!(SceneFile, "scene", 18);
 
 /// Altitude of an origin where none was measured: heights are relative. A measured zero is positive.
 pub const NO_ALTITUDE: f64 = -0.0;
@@ -98,6 +100,11 @@ impl SceneFile {
     /// Whether measured positions place a component in the frame of `origin`.
     pub fn is_placed(&self, component: usize) -> bool {
         self.placed.get(component) == Some(&true)
+    }
+
+    /// What a component that is placed in the frame of `origin` may be off there as a whole, where that is told.
+    pub fn frame_errors_of(&self, component: usize) -> Option<&FrameErrors> {
+        self.frame_errors.get(component).filter(|_| self.is_placed(component))?.as_ref()
     }
 
     /// Whether a component's frame is that of the largest.

@@ -45,8 +45,8 @@ pub const INDEX_VERSION: u32 = setloc_index::VERSION;
 /// 24: panoramas twist directions, too. 25: each a little by its own. 26: says how their windows are stretched.
 /// 28: in doubt where images stand together and share next to nothing. 29: and matches contradict that. 30: errors
 /// that neighbouring bearings share by all verified matches. 31: cameras that are not used as they were told. 32: names the right
-/// images where some have no features.
-pub const SCENE_VERSION: u32 = 32;
+/// images where some have no features. 33: says what measured positions leave open of its frame.
+pub const SCENE_VERSION: u32 = 33;
 /// Version of the search for the scene points nearest to a photo's features.
 pub const NEAREST_VERSION: u32 = setloc_index::VERSION;
 /// Version of single-photo localization.

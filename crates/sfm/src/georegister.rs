@@ -6,6 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::bundle::{PositionPrior, RobustLoss};
+use crate::frame_errors::{FrameErrors, Misfit, turn_and_scale};
 use crate::{ImageId, Reconstruction, Similarity};
 
 /// How to align a component to GPS, and how certain that is beside what images show.
@@ -33,6 +34,8 @@ pub struct Georegistration {
     pub enu_from_world: Similarity,
     /// Distance between each used image's centre and its measurement in metres, and whether it agrees.
     pub residuals: Vec<(ImageId, f64, bool)>,
+    /// What the component may be off as a whole; `None` where the measurements are no more than fix it.
+    pub errors: Option<FrameErrors>,
 }
 
 /// A measured position in local east-north-up metres.
@@ -108,8 +111,7 @@ pub(crate) fn without_frame(
         let from_middle = (place - middle) / reach;
         let mut moves = SMatrix::<f64, 3, 7>::zeros();
         moves.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
-        moves.fixed_view_mut::<3, 3>(0, 3).copy_from(&-from_middle.cross_matrix());
-        moves.set_column(6, &from_middle);
+        moves.fixed_view_mut::<3, 4>(0, 3).copy_from(&turn_and_scale(&from_middle));
         moves
     };
     let (mut normal, mut right) = (SMatrix::<f64, 7, 7>::zeros(), SVector::<f64, 7>::zeros());
@@ -161,6 +163,7 @@ pub fn georegister(
         let on_a_line = sideways_spread(&agreeing) < SPREAD_OF_NOISE * params.gps_sigma_m;
         if on_a_line { alignment.robust(2, seed, |pairs| fit_upright(&up, pairs)) } else { None }
     });
+    let tilt_variance = level.map(|level| tilt_variance(&level, reconstruction, upright));
     let best = level.or(free).filter(|best| alignment.is_fixed(best))?;
     let residuals = pairs
         .iter()
@@ -169,7 +172,8 @@ pub fn georegister(
             (pair.image, pair.offset(&best).norm(), agrees)
         })
         .collect();
-    Some(Georegistration { enu_from_world: best, residuals })
+    let errors = FrameErrors::of(&alignment.misfits(&best), tilt_variance, params.height_factor);
+    Some(Georegistration { enu_from_world: best, residuals, errors })
 }
 
 /// An image's centre in the component's frame and where it was measured.
@@ -212,6 +216,16 @@ impl Alignment<'_> {
     fn agreeing(&self, similarity: &Similarity) -> Vec<usize> {
         let agrees = |&at: &usize| self.error(similarity, &self.pairs[at]) <= self.params.max_error_sigma;
         (0..self.pairs.len()).filter(agrees).collect()
+    }
+
+    /// What the measurements that agree miss.
+    fn misfits(&self, similarity: &Similarity) -> Vec<Misfit> {
+        let misfit = |at: usize| {
+            let pair = &self.pairs[at];
+            let place = similarity.transform_point(&pair.center);
+            Misfit { place, offset: pair.offset(similarity), has_height: pair.measured.has_height }
+        };
+        self.agreeing(similarity).into_iter().map(misfit).collect()
     }
 
     /// Whether the measurements that agree tell a scale: they spread by more than they miss the centres by. Those of one place, or
@@ -271,16 +285,26 @@ const LEAST_SPREAD: f64 = 0.01;
 /// Sideways spread of the measurements, in standard deviations of one, below which they do not fix the tilt.
 const SPREAD_OF_NOISE: f64 = 5.0;
 
-/// The up direction that most upright images agree on: their cameras' −y axes, averaged.
+/// The up directions of upright images: their cameras' −y axes.
+fn ups<'r>(
+    reconstruction: &'r Reconstruction,
+    upright: &'r [bool],
+) -> impl Iterator<Item = Vector3<f64>> + 'r {
+    let level = reconstruction.images.iter().zip(upright).filter(|&(_, &level)| level);
+    level.filter_map(|(image, _)| Some(image.world_from_camera?.rotation * -Vector3::y()))
+}
+
+/// The up direction that most upright images agree on: the mean of theirs.
 fn mean_up(reconstruction: &Reconstruction, upright: &[bool]) -> Option<Vector3<f64>> {
-    let sum: Vector3<f64> = reconstruction
-        .images
-        .iter()
-        .zip(upright)
-        .filter(|&(_, &level)| level)
-        .filter_map(|(image, _)| Some(image.world_from_camera?.rotation * -Vector3::y()))
-        .sum();
+    let sum: Vector3<f64> = ups(reconstruction, upright).sum();
     (sum.norm() > 0.5).then(|| sum.normalize())
+}
+
+/// Variance of the tilt about either axis, in radians squared, of what the mean of the up directions levels, if each is off by its own.
+fn tilt_variance(level: &Similarity, reconstruction: &Reconstruction, upright: &[bool]) -> f64 {
+    let tilts = ups(reconstruction, upright).map(|up| (level.rotation * up).xy().norm_squared());
+    let (count, sum) = tilts.fold((0.0_f64, 0.0), |(count, sum), tilt| (count + 1.0, sum + tilt));
+    sum / (2.0 * (count - 1.0).max(1.0) * count.max(1.0))
 }
 
 /// Second singular value of the centred points, as a standard deviation.

@@ -10,6 +10,7 @@ pub mod bundle;
 mod common_views;
 mod direction;
 mod estranged;
+mod frame_errors;
 mod geometry;
 mod georegister;
 mod ground;
@@ -28,6 +29,7 @@ mod visibility;
 mod walls;
 
 pub use alignment::{ALIGNMENT_VERSION, AlignmentParams, AlignmentReport, KnownOfComponent, align_tracks};
+pub use frame_errors::FrameErrors;
 pub use geometry::{Rigid, Similarity, nearest_rotation};
 pub use georegister::{GeoregisterParams, Georegistration, MeasuredPosition, MeasuredPositions, georegister};
 pub use ground::{register_by_ground, sharpen_lengths};

@@ -21,7 +21,7 @@ use crate::error::Hinted;
 use crate::export::{
     Marker, localizations_json, origin_json, ply, renew_colmap, scene_images_json, stated_sigma, top_view_png,
 };
-use crate::jobs::LocateJobs;
+use crate::jobs::{LocateJobs, how_fixed};
 use crate::locating::{Located, Mode, grow, locate};
 use crate::pictures::PictureBook;
 use crate::print;
@@ -77,6 +77,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     told.estimated_cameras().iter().for_each(|line| print::note(line));
     write_results(&args.output, &located, &what.scene, &target, &session)?;
     warn_skipped(&located.skipped);
+    note_of_frame(&what.scene).iter().for_each(|note| print::note(&format!("note: {note}")));
     warn_of_scene(&what.scene.warnings);
     for advice in located.set.iter().flat_map(|set| &set.advice) {
         print::note(&format!("advice: {advice}"));
@@ -119,6 +120,12 @@ fn with_told_alone(given: &[SourceImage], photos: &[SourceImage], located: &Loca
         )
     };
     given.iter().zip(photos).map(with_camera).collect()
+}
+
+/// How well measured positions fix the frame of a scene: on the map, photos are off by that too.
+fn note_of_frame(scene: &SceneFile) -> Option<String> {
+    let fixed = how_fixed(scene.frame_errors_of(0)?);
+    Some(format!("of the scene: measured positions place it on the map; {fixed}"))
 }
 
 /// Results may replace nothing that is read, but for the scene, which may grow in place.

@@ -68,6 +68,7 @@ struct Photo {
     inliers: usize,
     reasons: Vec<String>,
     sigma: Option<Sigma>,
+    wgs84_sigma: Option<MapSigma>,
     world_from_camera: Option<IgnoredAny>,
     #[serde(default)]
     component: usize,
@@ -80,6 +81,11 @@ struct Photo {
 struct Sigma {
     rotation_deg: f64,
     position: f64,
+}
+
+#[derive(Deserialize)]
+struct MapSigma {
+    horizontal_m: f64,
 }
 
 /// `report.json`; a folder without one has no times.
@@ -231,6 +237,9 @@ fn of_photos(name: &str, located: LocatedPoses) -> Digest {
         let precision = photo.sigma.map_or_else(String::new, |sigma| {
             format!(", σ {:.3} and {:.3}°", sigma.position, sigma.rotation_deg)
         });
+        let on_map = photo
+            .wgs84_sigma
+            .map_or_else(String::new, |sigma| format!(", {:.2} m on the map", sigma.horizontal_m));
         let is_apart = photo.world_from_camera.is_some() && photo.own_frame;
         let frame = if is_apart { format!(", {}", apart(photo.component)) } else { String::new() };
         ImageRow {
@@ -238,7 +247,7 @@ fn of_photos(name: &str, located: LocatedPoses) -> Digest {
             name: photo.name,
             standing,
             verdict: verdict.to_owned(),
-            evidence: format!("{}, {} inliers{precision}{frame}", photo.method, photo.inliers),
+            evidence: format!("{}, {} inliers{precision}{on_map}{frame}", photo.method, photo.inliers),
             reasons: photo.reasons,
         }
     };

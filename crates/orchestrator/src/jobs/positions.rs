@@ -2,14 +2,11 @@
 
 use nalgebra::Vector2;
 use setloc_sfm::{
-    GeoregisterParams, Georegistration, ImageId, MeasuredPosition, MeasuredPositions, Reconstruction,
-    georegister,
+    FrameErrors, GeoregisterParams, Georegistration, ImageId, MeasuredPosition, MeasuredPositions,
+    Reconstruction, georegister,
 };
 
 use super::model::image_of_place_holder;
-
-/// Positions from which on their own deviations tell how well they fix a frame.
-const MIN_POSITIONS: usize = 3;
 
 /// Standard deviation of the scale, as a share of it, and of the heading, in radians, from which on they are called poor.
 const POOR: f64 = 0.05;
@@ -121,78 +118,59 @@ pub(super) fn fixes(
     placed.residuals.iter().filter_map(fix).collect()
 }
 
-/// How well some positions fix a frame.
-///
-/// Of positions at distances rᵢ from their middle, each off by σ in either direction, scale and heading have the
-/// deviation σ / √Σrᵢ², and the middle σ / √n: what all are off together is in neither.
-struct Fixed {
-    /// How many agree with each other.
-    count: usize,
-    /// Metres round their middle within which they mostly are.
-    within_m: f64,
-    /// σ, and what follows from it; `None` where no more are than fix the frame.
-    deviations: Option<Deviations>,
-}
-
-struct Deviations {
-    noise_m: f64,
-    /// Of the scale, as a share of it, and of the heading in radians.
-    scale: f64,
-    middle_m: f64,
-}
-
-impl Fixed {
-    fn by(fixes: &[Fix]) -> Self {
-        let used: Vec<&Fix> = fixes.iter().filter(|fix| fix.agrees).collect();
-        let count = used.len().max(1) as f64;
-        let middle = used.iter().map(|fix| fix.center).sum::<Vector2<f64>>() / count;
-        let spread = used.iter().map(|fix| (fix.center - middle).norm_squared()).sum::<f64>().sqrt();
-        let deviations = (used.len() >= MIN_POSITIONS).then(|| {
-            // Of the two coordinates of each, four go into scale, heading and place.
-            let freedom = (2 * used.len() - 4) as f64;
-            let noise_m = (used.iter().map(|fix| fix.offset_m.powi(2)).sum::<f64>() / freedom).sqrt();
-            Deviations { noise_m, scale: noise_m / spread, middle_m: noise_m / count.sqrt() }
-        });
-        Self { count: used.len(), within_m: 2.0 * spread / count.sqrt(), deviations }
-    }
-}
-
 /// How many of `listed` images have positions, how far off these are, and how well they fix the frame.
-pub(super) fn note(fixes: &[Fix], listed: usize) -> String {
+pub(super) fn note(fixes: &[Fix], errors: Option<&FrameErrors>, listed: usize) -> String {
     let mut metres: Vec<f64> = fixes.iter().map(|fix| fix.offset_m).collect();
     metres.sort_by(f64::total_cmp);
     let median = metres.get(metres.len() / 2).copied().unwrap_or_default();
     let positions = format!("positions: {} of {listed} images, median deviation {median:.2} m", fixes.len());
-    match Fixed::by(fixes).deviations {
-        Some(Deviations { scale, middle_m, .. }) => format!(
-            "{positions}; if each is off by its own they fix scale to ± {:.2} %, heading to ± {:.2}° and place to ± \
-             {middle_m:.2} m (one sigma)",
-            100.0 * scale,
-            scale.to_degrees()
-        ),
+    match errors {
+        Some(errors) => format!("{positions}; {}", how_fixed(errors)),
         None => positions,
     }
 }
 
+/// How well measured positions fix a frame, in words.
+pub fn how_fixed(errors: &FrameErrors) -> String {
+    format!(
+        "if each is off by its own they fix scale to ± {:.2} %, heading to ± {:.2}° and place to ± {:.2} m (one sigma)",
+        100.0 * errors.scale(),
+        errors.heading_rad().to_degrees(),
+        errors.place_m()
+    )
+}
+
 /// Says that few positions, or such as lie close together for their noise, fix scale and heading.
-pub(super) fn warning(fixes: &[Fix]) -> Option<String> {
-    let Fixed { count, within_m, deviations } = Fixed::by(fixes);
-    let Some(Deviations { noise_m, scale, .. }) = deviations else {
+pub(super) fn warning(fixes: &[Fix], errors: Option<&FrameErrors>) -> Option<String> {
+    let used: Vec<&Fix> = fixes.iter().filter(|fix| fix.agrees).collect();
+    let (count, within_m) = (used.len(), within_m(&used));
+    let Some(errors) = errors else {
         return Some(format!(
             "{count} measured positions within {within_m:.1} m fix scale and heading, and nothing tells how far these are off"
         ));
     };
-    (scale > POOR).then(|| {
+    (errors.scale().max(errors.heading_rad()) > POOR).then(|| {
         format!(
-            "{count} measured positions within {within_m:.1} m fix scale and heading to ± {:.0} % and {:.0}° only: they are off by {noise_m:.1} m",
-            100.0 * scale,
-            scale.to_degrees()
+            "{count} measured positions within {within_m:.1} m fix scale and heading to ± {:.0} % and {:.0}° only: they are off by {:.1} m",
+            100.0 * errors.scale(),
+            errors.heading_rad().to_degrees(),
+            errors.noise_m
         )
     })
 }
 
+/// Metres round their middle within which positions mostly are.
+fn within_m(fixes: &[&Fix]) -> f64 {
+    let count = fixes.len().max(1) as f64;
+    let middle = fixes.iter().map(|fix| fix.center).sum::<Vector2<f64>>() / count;
+    let squares = fixes.iter().map(|fix| (fix.center - middle).norm_squared()).sum::<f64>();
+    2.0 * (squares / count).sqrt()
+}
+
 #[cfg(test)]
 mod tests {
+    use nalgebra::{Matrix4, Vector3};
+
     use super::*;
 
     /// Images in a row, two metres apart.
@@ -215,24 +193,33 @@ mod tests {
         assert!(contradicted_positions(&[], 5).is_empty());
     }
 
+    /// What they may be off as a whole.
+    fn errors(place_m: f64, scale: f64, noise_m: f64) -> FrameErrors {
+        FrameErrors {
+            middle: Vector3::zeros(),
+            noise_m,
+            shift: Vector3::repeat(place_m * place_m),
+            turn_and_scale: Matrix4::identity() * scale * scale,
+        }
+    }
+
     #[test]
     fn few_positions_and_noisy_ones_close_together_are_warned_of() {
-        let said = |count, offset_m| warning(&row(count, offset_m));
-        assert!(said(2, 0.0).unwrap().starts_with("2 measured positions within 2.0 m fix scale and heading"));
-        let poor = said(3, 0.5).unwrap();
+        let few = warning(&row(2, 0.0), None).unwrap();
+        assert!(few.starts_with("2 measured positions within 2.0 m fix scale and heading"), "{few}");
+        let poor = warning(&row(3, 0.5), Some(&errors(0.4, 0.217, 0.61))).unwrap();
         assert!(poor.contains("within 3.3 m fix scale and heading to ± 22 % and 12° only"), "{poor}");
         assert!(poor.ends_with("they are off by 0.6 m"), "{poor}");
-        assert_eq!(said(3, 0.02), None);
-        assert_eq!(said(20, 0.5), None);
+        assert_eq!(warning(&row(3, 0.02), Some(&errors(0.01, 0.01, 0.02))), None);
         let mut fixes = row(5, 0.1);
         assert_eq!(
-            note(&fixes, 8),
+            note(&fixes, Some(&errors(0.04, 0.0144, 0.1)), 8),
             "positions: 5 of 8 images, median deviation 0.10 m; if each is off by its own they fix scale to ± 1.44 %, \
              heading to ± 0.83° and place to ± 0.04 m (one sigma)"
         );
-        assert_eq!(note(&fixes[..2], 8), "positions: 2 of 8 images, median deviation 0.10 m");
+        assert_eq!(note(&fixes[..2], None, 8), "positions: 2 of 8 images, median deviation 0.10 m");
         // Those that contradict the others fix nothing.
         fixes.iter_mut().skip(2).for_each(|fix| fix.agrees = false);
-        assert!(warning(&fixes).unwrap().starts_with("2 measured positions"));
+        assert!(warning(&fixes, None).unwrap().starts_with("2 measured positions"));
     }
 }

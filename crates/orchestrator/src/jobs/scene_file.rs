@@ -61,7 +61,9 @@ impl SceneRecipe {
             },
             || features_of_registered(inputs, &output),
         );
-        let placed: Vec<bool> = output.report.georegistrations.iter().map(Option::is_some).collect();
+        let georegistrations = &output.report.georegistrations;
+        let placed: Vec<bool> = georegistrations.iter().map(Option::is_some).collect();
+        let frame_errors = georegistrations.iter().map(|placed| placed.as_ref()?.errors.clone()).collect();
         let origin = self.origin.filter(|_| placed.first() == Some(&true));
         let origin =
             origin.map(|at| if self.has_altitudes() { at } else { Wgs84 { alt: NO_ALTITUDE, ..at } });
@@ -71,7 +73,7 @@ impl SceneRecipe {
             .collect();
         let shared_sigmas = self.shared_sigmas(inputs, &output)?;
         let errors: Vec<Option<ModelErrors>> = (output.components.iter())
-            .zip(output.report.georegistrations.iter().zip(&shared_sigmas))
+            .zip(georegistrations.iter().zip(&shared_sigmas))
             .map(|(component, (placed, shared))| {
                 let positions = self.measured.for_adjustment(component, placed.as_ref());
                 ModelErrors::of_model(component, positions.as_ref(), *shared)
@@ -80,6 +82,7 @@ impl SceneRecipe {
         let mut scene = SceneFile {
             indices: indices_of_file,
             placed: placed.into_iter().map(|is_placed| is_placed && origin.is_some()).collect(),
+            frame_errors,
             content: content(inputs, &output, &shared_sigmas)?,
             features: features?,
             config: self.config.clone(),
@@ -137,6 +140,7 @@ impl SceneRecipe {
             "the measured positions have no altitudes: heights are relative, and left out where WGS84 is told".to_owned()
         });
         let fixes = fixes_of(output, &measured.positions);
+        let frame_errors = scene.frame_errors.first().and_then(Option::as_ref);
         let recall = worst_recall(&scene.indices);
         let doubts = scene.components.iter().zip(doubts);
         let warnings = warnings
@@ -144,10 +148,10 @@ impl SceneRecipe {
             .chain(doubts.filter_map(|(component, doubt)| doubt.warning(component)))
             .chain(accuracies.iter().flatten().filter_map(|(model, accuracy)| accuracy.warning(model)))
             .chain(recall.as_ref().and_then(Recall::warning))
-            .chain(fixes.as_deref().and_then(positions::warning));
+            .chain(fixes.as_deref().and_then(|fixes| positions::warning(fixes, frame_errors)));
         let notes = (output.report.merges.iter().filter_map(MergeRecord::sentence))
             .chain(recall.as_ref().map(Recall::note))
-            .chain(fixes.as_deref().map(|fixes| positions::note(fixes, names.len())))
+            .chain(fixes.as_deref().map(|fixes| positions::note(fixes, frame_errors, names.len())))
             .chain(relative)
             .chain(of_largest.and_then(|(model, accuracy)| accuracy.note(model, unit)))
             .chain(models().filter_map(lengths_note))

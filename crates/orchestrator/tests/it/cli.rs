@@ -151,6 +151,7 @@ fn what_measured_positions_do_not_tell_is_said_and_left_out() {
     assert!(text.contains(note), "{text}");
     let poses = export("json");
     assert!(poses.contains("\"wgs84\": {") && !poses.contains("\"alt\""), "{poses}");
+    assert!(poses.contains("\"horizontal_m\": ") && !poses.contains("\"vertical_m\""), "{poses}");
     assert_eq!(coordinates(), 2);
     assert!(!export("kml").contains("ellipsoidal_height_m"));
 
