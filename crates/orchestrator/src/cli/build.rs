@@ -10,7 +10,7 @@ use setloc_sfm::{ImageId, MOST_NAMED, Reconstruction, listed};
 
 use super::Answer;
 use super::args::{BuildArgs, PlanArgs, PlanFormat, SourceArgs};
-use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input};
+use super::outputs::{PAGE, PICTURE, refuse_folder, refuse_image_folder, refuse_input};
 use crate::building::{
     BuildOutcome, Built, Pass, SceneSource, alike_pairs, asks_turns, build_scene, by_passes,
     has_guessed_cameras, left_apart, tell_cameras,
@@ -67,13 +67,14 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
         BuildOutcome::Unchanged(run, skipped, warnings) => {
             add_warnings(&mut folder, warnings);
             let scene = Arc::new(SceneFile::read(output)?);
-            renew_report(&export, &scene, &skipped, &folder.warnings)?;
+            renew_report(&export, &scene, &skipped, &told_by_scene(&folder, &scene))?;
             (scene, run, skipped, false)
         }
         BuildOutcome::Built(built) => {
             let Built { scene, hash, skipped, warnings, run, .. } = *built;
             add_warnings(&mut folder, warnings);
-            write_report(&export, (&scene, hash), &skipped, &folder.warnings, &session)?;
+            let told = told_by_scene(&folder, &scene);
+            write_report(&export, (&scene, hash), &skipped, &told, &session)?;
             (scene, run, skipped, true)
         }
     };
@@ -317,7 +318,7 @@ pub fn scene_markers(model: &Reconstruction, grown: &BTreeSet<&str>) -> Vec<Mark
     model.registered().filter_map(marker).collect()
 }
 
-/// The images of guessed cameras that the scene has registered, with the cameras that it has of them.
+/// The images with the cameras that the scene has of those that it has registered in place of guessed ones.
 fn told_by_scene(folder: &ImageFolder, scene: &SceneFile) -> ImageFolder {
     let registered = |component: &Reconstruction, id: ImageId| {
         (component.images[id.index()].name.clone(), component.camera_of(id).clone())
@@ -329,7 +330,8 @@ fn told_by_scene(folder: &ImageFolder, scene: &SceneFile) -> ImageFolder {
         let camera = told.get(&image.name).filter(|_| image.calibration == Calibration::Guessed)?.clone();
         Some(SourceImage { camera, camera_origin: CameraOrigin::Estimated, ..image.clone() })
     };
-    ImageFolder { images: folder.images.iter().filter_map(image).collect(), ..ImageFolder::default() }
+    let images = folder.images.iter().map(|given| image(given).unwrap_or_else(|| given.clone())).collect();
+    folder.once_told(images)
 }
 
 /// Poses, and of each component the point cloud, COLMAP model and picture: of the largest in the folder itself, of the
@@ -340,6 +342,8 @@ pub fn write_models(
     features: &BTreeMap<String, Arc<ImageFeatures>>,
 ) -> Result<()> {
     let none = [Reconstruction::default()];
+    // A page of other results would contradict these.
+    remove_files(folder, &[PAGE])?;
     let components = if scene.components.is_empty() { &none[..] } else { &scene.components };
     let grown = scene.grown_names();
     let write = |(at, component)| write_model(&component_folder(folder, at), component, features, &grown);
@@ -389,18 +393,18 @@ fn remove_model(folder: &Path) -> Result<()> {
     remove_files(folder, &[POINT_CLOUD, PICTURE])
 }
 
-/// What the run cost and what is wrong with the scene, and with the images that it was given; written last.
+/// What the run cost, and what is to be said of the scene and of the images that it was given, with the cameras that it told; written
+/// last.
 pub fn write_report(
     folder: &Path,
     (scene, hash): (&SceneFile, ContentHash),
     skipped: &[SkippedImage],
-    warnings: &[String],
+    images: &ImageFolder,
     session: &Session,
 ) -> Result<()> {
     let mut report = session.report.to_json();
     report["scene"] = serde_json::json!(hash);
-    report["notes"] = serde_json::json!(scene.notes);
-    note_odd(&mut report, scene, skipped, warnings);
+    note_remarks(&mut report, scene, skipped, images);
     write_json(&folder.join(REPORT), &report)
 }
 
@@ -409,18 +413,23 @@ fn renew_report(
     folder: &Path,
     scene: &SceneFile,
     skipped: &[SkippedImage],
-    warnings: &[String],
+    images: &ImageFolder,
 ) -> Result<()> {
     let file = folder.join(REPORT);
     let before: Value = serde_json::from_slice(&std::fs::read(&file)?)?;
     let mut report = before.clone();
-    note_odd(&mut report, scene, skipped, warnings);
-    if report == before { Ok(()) } else { write_json(&file, &report) }
+    note_remarks(&mut report, scene, skipped, images);
+    if report == before {
+        return Ok(());
+    }
+    remove_files(folder, &[PAGE])?;
+    write_json(&file, &report)
 }
 
-fn note_odd(report: &mut Value, scene: &SceneFile, skipped: &[SkippedImage], warnings: &[String]) {
+fn note_remarks(report: &mut Value, scene: &SceneFile, skipped: &[SkippedImage], images: &ImageFolder) {
     report["skipped"] = serde_json::json!(skipped);
-    report["warnings"] = serde_json::json!([warnings, &scene.warnings].concat());
+    report["warnings"] = serde_json::json!([&images.warnings[..], &scene.warnings].concat());
+    report["notes"] = serde_json::json!([&scene.notes[..], &images.estimated_cameras()].concat());
 }
 
 /// Readable JSON.

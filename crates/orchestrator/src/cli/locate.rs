@@ -13,7 +13,7 @@ use super::args::LocateArgs;
 use super::build::{
     export_folder, remark, scene_markers, warn, warn_skipped, write_json, write_models, write_report,
 };
-use super::outputs::{PICTURE, refuse_folder, refuse_image_folder, refuse_input, refuse_same_folder};
+use super::outputs::{PAGE, PICTURE, refuse_folder, refuse_image_folder, refuse_input, refuse_same_folder};
 use crate::dataset::{
     CameraBook, CameraOrigin, GeoSource, ImageFolder, SourceImage, list_images, unread_images,
 };
@@ -27,7 +27,7 @@ use crate::pictures::PictureBook;
 use crate::print;
 use crate::scene::SceneFile;
 use crate::session::Session;
-use crate::store::write_atomically;
+use crate::store::{remove_files, write_atomically};
 use crate::text::apart;
 
 /// Red, for the target.
@@ -73,9 +73,10 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     let (given, said) = (photos.images.clone(), photos.warnings.len());
     let located = locate(&session, &mut photos, &what, mode, &name, &target)?;
     warn(&photos.warnings[said..]);
-    let told = ImageFolder { images: with_told_alone(&given, &photos.images, &located), ..photos.clone() };
+    let answered = with_answered_cameras(&given, &located);
+    let told = ImageFolder { images: given, ..photos.clone() }.once_told(answered);
     told.estimated_cameras().iter().for_each(|line| print::note(line));
-    write_results(&args.output, &located, &what.scene, &target, &session)?;
+    write_results(&args.output, &located, (&what.scene, &target), &told, &session)?;
     warn_skipped(&located.skipped);
     note_of_frame(&what.scene).iter().for_each(|note| print::note(&format!("note: {note}")));
     warn_of_scene(&what.scene.warnings);
@@ -100,26 +101,25 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
     Ok((what.scene, located, if found && grown { Answer::Done } else { Answer::Negative }))
 }
 
-/// The photos with the cameras that they told alone, where that is their answer and the set told none; `given` are the
-/// photos before.
-fn with_told_alone(given: &[SourceImage], photos: &[SourceImage], located: &Located) -> Vec<SourceImage> {
+/// The photos with the cameras of their answers, where these tell what was a guess.
+fn with_answered_cameras(given: &[SourceImage], located: &Located) -> Vec<SourceImage> {
     let answers = located.answers();
-    let told = |given: &SourceImage| {
-        let (method, photo) = answers.iter().find(|(_, photo)| photo.name == given.name)?;
-        let is_told = *method == "single"
-            && photo.verdict == Verdict::Localized
-            && given.calibration == Calibration::Guessed
-            && photo.camera != given.camera;
-        is_told.then(|| photo.camera.clone())
-    };
-    let with_camera = |(given, photo): (&SourceImage, &SourceImage)| {
-        let camera = told(given).filter(|_| photo.camera_origin != CameraOrigin::Estimated);
-        camera.map_or_else(
-            || photo.clone(),
-            |camera| SourceImage { camera, camera_origin: CameraOrigin::Estimated, ..photo.clone() },
+    let with_camera = |given: &SourceImage| {
+        let is_told = |photo: &&PhotoLocalization| {
+            let was_guess = given.calibration == Calibration::Guessed && photo.camera != given.camera;
+            was_guess && photo.name == given.name && photo.world_from_camera.is_some()
+        };
+        let told = answers.iter().map(|(_, photo)| *photo).find(is_told);
+        told.map_or_else(
+            || given.clone(),
+            |photo| SourceImage {
+                camera: photo.camera.clone(),
+                camera_origin: CameraOrigin::Estimated,
+                ..given.clone()
+            },
         )
     };
-    given.iter().zip(photos).map(with_camera).collect()
+    given.iter().map(with_camera).collect()
 }
 
 /// How well measured positions fix the frame of a scene: on the map, photos are off by that too.
@@ -179,7 +179,7 @@ fn write_grown(
     write_atomically(output, &grown.file)?;
     write_models(&export, &grown.scene, &BTreeMap::new())?;
     book.write(output)?;
-    write_report(&export, (&grown.scene, grown.hash), &[], &[], session)?;
+    write_report(&export, (&grown.scene, grown.hash), &[], &ImageFolder::default(), session)?;
     let apart = located.answers().into_iter().map(|(_, photo)| photo);
     let apart = apart.filter(|photo| photo.verdict == Verdict::Localized && photo.component > 0);
     let apart: Vec<&str> = apart.map(|photo| photo.name.as_str()).collect();
@@ -242,14 +242,16 @@ fn line(method: &str, photo: &PhotoLocalization, scene: &SceneFile) -> String {
     format!("{}\t{verdict}\t{method}\t{}{pose}", photo.name, photo.inliers)
 }
 
-/// Poses, point cloud, COLMAP model, picture and report.
+/// Poses, point cloud, COLMAP model, picture and report; `told` are the photos with the cameras of their answers.
 fn write_results(
     folder: &Path,
     located: &Located,
-    scene: &SceneFile,
-    target: &str,
+    (scene, target): (&SceneFile, &str),
+    told: &ImageFolder,
     session: &Session,
 ) -> Result<()> {
+    // A page of other results would contradict these.
+    remove_files(folder, &[PAGE])?;
     let answers = located.answers();
     let best: Vec<PhotoLocalization> = answers.iter().map(|(_, photo)| (*photo).clone()).collect();
     let set = located.set.as_ref();
@@ -299,51 +301,57 @@ fn write_results(
     }
     write_atomically(&folder.join(PICTURE), &top_view_png(model, &markers)?)?;
     let mut report = session.report.to_json();
-    report["warnings"] = json!(located.warnings);
+    report["warnings"] = json!(told.warnings);
+    let of_frame = note_of_frame(scene).into_iter();
+    report["notes"] = json!(of_frame.chain(told.estimated_cameras()).collect::<Vec<_>>());
     write_json(&folder.join("report.json"), &report)
 }
 
 #[cfg(test)]
 mod tests {
+    use setloc_camset::SetLocalization;
     use setloc_features::Camera;
+    use setloc_sfm::Rigid;
 
     use super::*;
 
     #[test]
-    fn what_photos_tell_of_their_cameras_alone_is_said_once() {
+    fn the_cameras_that_are_said_to_be_estimated_are_those_of_the_answers() {
         let camera = |focal| Camera::from_focal_guess(40, 30, focal);
-        let image = |name: &str, calibration, camera_origin| SourceImage {
+        let image = |name: &str, calibration| SourceImage {
             calibration,
-            camera_origin,
+            camera_origin: CameraOrigin::Listed,
             ..SourceImage::guessed(name, camera(48.0))
         };
         let photo = |name: &str, verdict, focal| PhotoLocalization {
             name: name.to_owned(),
             camera: camera(focal),
             component: 0,
-            world_from_camera: None,
+            world_from_camera: (verdict != Verdict::NotLocalized).then(Rigid::identity),
             covariance: None,
             inliers: 0,
             verdict,
             reasons: Vec::new(),
         };
-        let listed = CameraOrigin::Listed;
-        let guess = |name| image(name, Calibration::Guessed, listed);
-        let given = [guess("a"), guess("b"), guess("c"), image("d", Calibration::Known, listed)];
-        let mut photos = given.clone();
-        photos[2].camera_origin = CameraOrigin::Estimated;
+        let [a, b, c, e] = ["a", "b", "c", "e"].map(|name| image(name, Calibration::Guessed));
+        let given = [a, b, c, image("d", Calibration::Known), e];
         let single = vec![
             photo("a", Verdict::Localized, 31.0),
             photo("b", Verdict::NotLocalized, 32.0),
-            photo("c", Verdict::Localized, 33.0),
+            photo("c", Verdict::Uncertain, 33.0),
             photo("d", Verdict::Localized, 34.0),
+            photo("e", Verdict::Localized, 48.0),
         ];
-        let located = Located { single, ..Located::default() };
-        let told =
-            ImageFolder { images: with_told_alone(&given, &photos, &located), ..ImageFolder::default() };
+        let set = SetLocalization {
+            rigid: vec![photo("c", Verdict::Localized, 35.0)],
+            refined: vec![photo("c", Verdict::Localized, 36.0)],
+            ..SetLocalization::default()
+        };
+        let located = Located { single, set: Some(set), ..Located::default() };
+        let told = ImageFolder { images: with_answered_cameras(&given, &located), ..ImageFolder::default() };
         let line =
             |focal: &str, photo: &str| format!("focal length estimated with the scene: {focal} px: {photo}");
-        assert_eq!(told.estimated_cameras(), [line("31.0", "a"), line("48.0", "c")]);
+        assert_eq!(told.estimated_cameras(), [line("31.0", "a"), line("36.0", "c")]);
     }
 
     #[test]

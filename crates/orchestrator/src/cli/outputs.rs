@@ -9,6 +9,9 @@ use crate::error::Hinted;
 /// The only image that is written into a folder of results itself.
 pub const PICTURE: &str = "top_view.png";
 
+/// The page that `report` makes of a folder of results, which a run that writes these anew removes.
+pub const PAGE: &str = "report.html";
+
 /// Refuses a file to be written that is one of those that are read, by whatever path it is named.
 pub fn refuse_input<'p>(inputs: impl IntoIterator<Item = &'p Path>, output: &Path) -> Result<()> {
     let Ok(output_at) = output.canonicalize() else { return Ok(()) };

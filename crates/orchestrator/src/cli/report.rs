@@ -5,7 +5,7 @@ use anyhow::Result;
 use super::Answer;
 use super::args::ReportArgs;
 use super::build::export_folder;
-use super::outputs::{PICTURE, refuse_folder, refuse_input};
+use super::outputs::{PAGE, PICTURE, refuse_folder, refuse_input};
 use crate::digest::Digest;
 use crate::print;
 use crate::store::write_atomically;
@@ -14,8 +14,8 @@ use crate::store::write_atomically;
 pub fn run(args: &ReportArgs) -> Result<Answer> {
     // Of a scene file: what `build` wrote beside it.
     let folder = if args.results.is_file() { export_folder(&args.results) } else { args.results.clone() };
-    let page = args.output.clone().unwrap_or_else(|| folder.join("report.html"));
-    refuse_folder("-o", &page, "report.html")?;
+    let page = args.output.clone().unwrap_or_else(|| folder.join(PAGE));
+    refuse_folder("-o", &page, PAGE)?;
     let read = ["poses.json", "report.json", PICTURE].map(|name| folder.join(name));
     let scene = folder.with_extension("setloc");
     refuse_input([&args.results, &scene].into_iter().chain(&read).map(PathBuf::as_path), &page)?;

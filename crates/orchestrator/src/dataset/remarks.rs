@@ -35,6 +35,17 @@ impl ImageFolder {
         (masked > 0).then(|| format!("masks: {masked} of {} images", self.images.len()))
     }
 
+    /// The same with these images, of which cameras are told that were a guess: that is nothing to warn of any more.
+    #[must_use]
+    pub fn once_told(&self, images: Vec<SourceImage>) -> Self {
+        let [guessed, still_guessed] = [&self.images, &images].map(|images| guessed_cameras(images));
+        let warning = |warning: &String| {
+            if guessed.as_ref() == Some(warning) { still_guessed.clone() } else { Some(warning.clone()) }
+        };
+        let warnings = self.warnings.iter().filter_map(warning).collect();
+        Self { images, warnings, skipped: self.skipped.clone() }
+    }
+
     /// What the set has told of cameras that were a guess, a line each.
     pub fn estimated_cameras(&self) -> Vec<String> {
         let mut cameras: Vec<(&Camera, Vec<String>)> = Vec::new();
@@ -393,6 +404,22 @@ mod tests {
         ];
         assert!(other_projections(&images).unwrap().ends_with(": a is cylindrical"));
         assert_eq!(other_projections(&images[1..]), None);
+    }
+
+    #[test]
+    fn cameras_that_are_told_since_are_no_guess_to_warn_of() {
+        let read = Folder::of(&[("a.png", 40, 30), ("b.png", 50, 30), ("c.png", 45, 30)]).read_alone();
+        assert!(read.warnings[0].ends_with(": p/a.png; p/b.png; p/c.png"), "{:?}", read.warnings);
+        let with_told = |names: &[&str]| {
+            let mut images = read.images.clone();
+            for image in images.iter_mut().filter(|image| names.contains(&image.name.as_str())) {
+                image.camera_origin = CameraOrigin::Estimated;
+            }
+            read.once_told(images).warnings
+        };
+        let one = with_told(&["p/a.png", "p/c.png"]);
+        assert!(one.len() == 1 && one[0].ends_with("(--cameras gives known ones): p/b.png"), "{one:?}");
+        assert_eq!(with_told(&["p/a.png", "p/b.png", "p/c.png"]), [""; 0]);
     }
 
     #[test]

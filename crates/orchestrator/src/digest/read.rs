@@ -97,6 +97,9 @@ struct Report {
     /// Of the images, and of a build also its scene's.
     #[serde(default)]
     warnings: Vec<String>,
+    /// The same, and on cameras that were estimated.
+    #[serde(default)]
+    notes: Vec<String>,
 }
 
 impl Digest {
@@ -127,17 +130,21 @@ impl Digest {
             Poses::Scene(scene) => of_scene(&title, scene, report.skipped),
             Poses::Located(located) => of_photos(&title, located),
         };
-        let mut warnings = report.warnings;
-        let further = digest.warnings.iter().filter(|warning| !warnings.contains(warning)).cloned();
-        let further: Vec<String> = further.collect();
-        warnings.extend(further);
         Ok(Self {
             stages: report.stages,
-            warnings,
+            warnings: with_further(report.warnings, &digest.warnings),
+            notes: with_further(report.notes, &digest.notes),
             top_view: std::fs::read(folder.join("top_view.png")).ok(),
             ..digest
         })
     }
+}
+
+/// Some lines and those of others that are not among them.
+fn with_further(mut lines: Vec<String>, others: &[String]) -> Vec<String> {
+    let further: Vec<String> = others.iter().filter(|line| !lines.contains(line)).cloned().collect();
+    lines.extend(further);
+    lines
 }
 
 fn of_scene(name: &str, scene: ScenePoses, skipped: Vec<SkippedImage>) -> Digest {

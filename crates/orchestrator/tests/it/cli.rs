@@ -114,11 +114,24 @@ fn report_and_status_tell_what_came_out() {
     // Photos without cameras.json, one of them twice.
     let photos = folder.path().join("town/queries/lane");
     std::fs::copy(photos.join("img_00.jpg"), photos.join("img_04.jpg")).unwrap();
-    let locate_again = run(&["locate", "s.setloc", "town/queries/lane", "-o", "again", "--mode", "single"]);
+    let again = ["locate", "s.setloc", "town/queries/lane", "-o", "again", "--mode", "single"];
+    let locate_again = run(&again);
     assert!(matches!(locate_again.status.code(), Some(0 | 1)), "{}", said(&locate_again));
+    assert!(said(&locate_again).contains("warning: focal length unknown, "), "{}", said(&locate_again));
     let of_again = gave(&run(&["report", "again"]));
     let equal = "warning: images of equal content: lane/img_00.jpg and lane/img_04.jpg\n";
-    assert!(of_again.contains(equal) && of_again.contains("warning: focal length unknown, "), "{of_again}");
+    assert!(of_again.contains(equal), "{of_again}");
+    let estimated =
+        of_again.lines().filter(|line| line.starts_with("note: focal length estimated with the scene: "));
+    let estimated: Vec<&str> = estimated.collect();
+    let is_estimated = estimated.iter().any(|line| line.contains("lane/img_00.jpg"));
+    let unknown = of_again.lines().find(|line| line.starts_with("warning: focal length unknown, "));
+    assert!(is_estimated && !unknown.is_some_and(|line| line.contains("lane/img_00.jpg")), "{of_again}");
+    // The page of these results goes with them.
+    let page = folder.path().join("again/report.html");
+    assert!(page.is_file());
+    run(&again);
+    assert!(!page.exists());
 }
 
 #[test]
@@ -157,7 +170,17 @@ fn what_measured_positions_do_not_tell_is_said_and_left_out() {
 
     let text = build("name,lat,lon,alt", ",0", 4);
     assert!(!text.contains(note), "{text}");
-    assert!(export("json").contains("\"alt\""));
+    let poses = export("json");
+    assert!(poses.contains("\"alt\"") && poses.contains("\"vertical_m\""), "{poses}");
+    let photos = ["locate", "s.setloc", "town/queries/lane", "-o", "out", "--mode", "single"];
+    let located = setloc(folder.path(), &photos);
+    assert!(
+        said(&located).contains("note: of the scene: measured positions place it on the map; if"),
+        "{}",
+        said(&located)
+    );
+    let report = gave(&setloc(folder.path(), &["report", "out"]));
+    assert!(report.contains(" m on the map") && report.contains("note: of the scene: measured"), "{report}");
     assert_eq!(coordinates(), 3);
     assert!(export("kml").contains("ellipsoidal_height_m"));
 
