@@ -1,13 +1,19 @@
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, Result};
 use serde::Serialize;
+use serde_json::{Value, json};
+use setloc_camset::{PhotoLocalization, Verdict};
+use setloc_sfm::{ImageId, Reconstruction};
 
 use super::Answer;
 use super::args::{BatchArgs, BuildArgs, LocateArgs, RunArgs, SourceArgs};
-use super::build::write_json;
+use super::build::{BuiltScene, build, write_json};
+use super::locate::{LocatedPhotos, locate_photos};
 use crate::error::{Interrupted, concerns_the_disk};
+use crate::export::localization_json;
 use crate::locating::Mode;
 use crate::manifest::{Manifest, SceneEntry, SetEntry, Variant};
 use crate::print;
@@ -21,6 +27,85 @@ struct Part {
     #[serde(skip_serializing_if = "Option::is_none")]
     reason: Option<String>,
     wall_s: f64,
+    /// What it came to, where it ran to its end.
+    #[serde(flatten)]
+    figures: Option<Figures>,
+}
+
+/// What a sweep is judged by.
+#[derive(Debug, Clone, Serialize)]
+#[serde(untagged)]
+enum Figures {
+    Scene(SceneFigures),
+    Set(SetFigures),
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct SceneFigures {
+    /// The scene file.
+    scene: PathBuf,
+    /// Images that were given.
+    images: usize,
+    /// Those with a pose in any component.
+    registered: usize,
+    /// Those with a pose in the largest.
+    in_largest: usize,
+    components: usize,
+    /// Points of the largest.
+    points: usize,
+}
+
+impl SceneFigures {
+    fn of(scene: PathBuf, built: &BuiltScene) -> Self {
+        let components = &built.scene.components;
+        let registered: BTreeSet<ImageId> = components.iter().flat_map(Reconstruction::registered).collect();
+        let main = built.scene.main();
+        Self {
+            scene,
+            images: built.images,
+            registered: registered.len(),
+            in_largest: main.map_or(0, |main| main.registered().count()),
+            components: components.len(),
+            points: main.map_or(0, |main| main.points.len()),
+        }
+    }
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct SetFigures {
+    /// The folder of its results.
+    results: PathBuf,
+    /// Photos with an answer.
+    photos: usize,
+    localized: usize,
+    uncertain: usize,
+    not_localized: usize,
+    /// The target, as `poses.json` has it; null where it could not be used.
+    target: Value,
+}
+
+impl SetFigures {
+    fn of(results: PathBuf, found: &LocatedPhotos) -> Self {
+        let answers = found.located.answers();
+        let count = |verdict| answers.iter().filter(|(_, photo)| photo.verdict == verdict).count();
+        let target = answers.iter().find(|(_, photo)| photo.name == found.target);
+        let stated = |(method, photo): &(&str, &PhotoLocalization)| {
+            let whole = localization_json(photo, &found.scene);
+            let mut stated = json!({ "method": method });
+            for key in ["name", "verdict", "inliers", "sigma", "wgs84_sigma"] {
+                stated[key] = whole[key].clone();
+            }
+            stated
+        };
+        Self {
+            results,
+            photos: answers.len(),
+            localized: count(Verdict::Localized),
+            uncertain: count(Verdict::Uncertain),
+            not_localized: count(Verdict::NotLocalized),
+            target: target.map_or(Value::Null, stated),
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -30,7 +115,7 @@ enum Outcome {
     /// Not registered, not localized.
     Negative,
     Failed,
-    /// Not tried: its scene failed, or the batch ended before.
+    /// Not tried: its scene failed or has no images, or the batch ended before.
     Skipped,
 }
 
@@ -44,7 +129,7 @@ struct Progress {
 
 impl Progress {
     /// Runs one part unless the batch has ended; says whether it gave something to go on with.
-    fn part(&mut self, name: String, work: impl FnOnce() -> Result<Answer>) -> bool {
+    fn part(&mut self, name: String, work: impl FnOnce() -> Result<(Answer, Figures)>) -> bool {
         if self.end.is_some() {
             self.skip(name);
             return false;
@@ -53,9 +138,9 @@ impl Progress {
         let begun = Instant::now();
         let result = work();
         let wall_s = begun.elapsed().as_secs_f64();
-        let (outcome, reason) = match result {
-            Ok(Answer::Done) => (Outcome::Done, None),
-            Ok(Answer::Negative) => (Outcome::Negative, None),
+        let (outcome, reason, figures) = match result {
+            Ok((Answer::Done, figures)) => (Outcome::Done, None, Some(figures)),
+            Ok((Answer::Negative, figures)) => (Outcome::Negative, None, Some(figures)),
             Err(error) if error.is::<Interrupted>() => {
                 self.end = Some(error);
                 self.skip(name);
@@ -67,15 +152,15 @@ impl Progress {
                 if concerns_the_disk(&error) {
                     self.end = Some(error);
                 }
-                (Outcome::Failed, Some(reason))
+                (Outcome::Failed, Some(reason), None)
             }
         };
-        self.parts.push(Part { name, outcome, reason, wall_s });
-        outcome != Outcome::Failed
+        self.parts.push(Part { name, outcome, reason, wall_s, figures });
+        outcome == Outcome::Done
     }
 
     fn skip(&mut self, name: String) {
-        self.parts.push(Part { name, outcome: Outcome::Skipped, reason: None, wall_s: 0.0 });
+        self.parts.push(Part { name, outcome: Outcome::Skipped, reason: None, wall_s: 0.0, figures: None });
     }
 
     fn count(&self, outcome: Outcome) -> usize {
@@ -131,13 +216,19 @@ fn run_scene(progress: &mut Progress, entry: &SceneEntry, variant: &Variant, pla
         cameras: entry.cameras.as_ref().map(below),
         run: places.run.clone(),
     };
-    let build = BuildArgs { source, export: None, print_config: false };
-    let built = progress.part(name.clone(), || super::build::run(&build));
+    let to_build = BuildArgs { source, export: None, print_config: false };
+    let built = progress.part(name.clone(), || {
+        let built = build(&to_build)?;
+        Ok((built.answer, Figures::Scene(SceneFigures::of(scene.clone(), &built))))
+    });
     for set in &entry.sets {
         let set_name = format!("{name}/{}", set.name);
         if built {
             let locate = locate_args(set, &scene, &folder, places);
-            progress.part(set_name, || Ok(super::locate::locate_photos(&locate)?.2));
+            progress.part(set_name, || {
+                let found = locate_photos(&locate)?;
+                Ok((found.answer, Figures::Set(SetFigures::of(locate.output.clone(), &found))))
+            });
         } else {
             progress.skip(set_name);
         }

@@ -15,6 +15,7 @@ use crate::building::{
     BuildOutcome, Built, Pass, SceneSource, alike_pairs, asks_turns, build_scene, by_passes,
     has_guessed_cameras, left_apart, tell_cameras,
 };
+use crate::codec;
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, unread_images};
 use crate::error::Hinted;
@@ -36,24 +37,43 @@ const GROWN_COLOR: [u8; 3] = [20, 150, 60];
 
 /// `setloc build`
 pub fn run(args: &BuildArgs) -> Result<Answer> {
-    let config = args.source.run.config()?;
     if args.print_config {
-        print::data(config.to_toml()?.trim_end())?;
+        print::data(args.source.run.config()?.to_toml()?.trim_end())?;
         return Ok(Answer::Done);
     }
+    Ok(build(args)?.answer)
+}
+
+/// What a build came to.
+pub struct BuiltScene {
+    pub scene: Arc<SceneFile>,
+    /// How many images it was given.
+    pub images: usize,
+    /// Negative when no image is registered.
+    pub answer: Answer,
+}
+
+/// Builds the scene and writes its files.
+pub fn build(args: &BuildArgs) -> Result<BuiltScene> {
+    let config = args.source.run.config()?;
     let output = &args.source.output;
     refuse_folder("-o", output, "scene.setloc")?;
     let export = args.export.clone().unwrap_or_else(|| export_folder(output));
     let files = list_sources(&args.source)?;
     refuse_inputs(&args.source, &files, &export)?;
+    let before = FileBefore::read(output)?;
     let mut folder = read_sources(&args.source, &files)?;
     refuse_input(folder.mask_files(), output)?;
     let session = args.source.run.session(output, Some(&export))?;
     let name = session.store.name_of("build", output);
-    let present = std::fs::read(output).ok().map(|bytes| ContentHash::of(&bytes));
     // The report is written last: exports of another scene, as a killed run leaves them, are none of this one.
-    let present = present.filter(|hash| reported_scene(&export) == Some(*hash));
+    let present = before.as_ref().map(|file| file.hash).filter(|hash| reported_scene(&export) == Some(*hash));
+    let stays =
+        |scene: &SceneFile| scene.main().is_none() && before.as_ref().is_some_and(|file| file.is_of_use);
     let write = |built: &Built| {
+        if stays(&built.scene) {
+            return Ok(());
+        }
         // Until it is written again nothing says whose these exports are.
         remove_files(&export, &[REPORT])?;
         let models = || write_models(&export, &built.scene, &built.features);
@@ -63,39 +83,85 @@ pub fn run(args: &BuildArgs) -> Result<Answer> {
     let seed = args.source.run.seed;
     let source = SceneSource { folder: &folder, config: &config, seed, name: &name, present };
     let outcome = build_scene(&session, source, write)?;
-    let (scene, run, skipped, is_new) = match outcome {
+    let (scene, run, skipped, written) = match outcome {
         BuildOutcome::Unchanged(run, skipped, warnings) => {
             add_warnings(&mut folder, warnings);
             let scene = Arc::new(SceneFile::read(output)?);
             renew_report(&export, &scene, &skipped, &told_by_scene(&folder, &scene))?;
-            (scene, run, skipped, false)
+            (scene, run, skipped, Written::AsBefore)
         }
         BuildOutcome::Built(built) => {
             let Built { scene, hash, skipped, warnings, run, .. } = *built;
             add_warnings(&mut folder, warnings);
-            let told = told_by_scene(&folder, &scene);
-            write_report(&export, (&scene, hash), &skipped, &told, &session)?;
-            (scene, run, skipped, true)
+            let written = if stays(&scene) { Written::Nothing } else { Written::Anew };
+            if written == Written::Anew {
+                let told = told_by_scene(&folder, &scene);
+                write_report(&export, (&scene, hash), &skipped, &told, &session)?;
+            }
+            (scene, run, skipped, written)
         }
     };
-    PictureBook::of(&folder.images).write(output)?;
-    tell(&scene, &folder, &export);
+    if written != Written::Nothing {
+        PictureBook::of(&folder.images).write(output)?;
+    }
+    let images = folder.images.len() + folder.skipped.len();
+    tell(&scene, &folder, images, &export);
     warn_skipped(&skipped);
     let (wall, cpu) = session.report.totals();
     let (ran, hits) = (run.ran.len(), run.hits);
     print::note(&format!("{ran} jobs ran, {hits} came from the cache; {wall:.1} s, {cpu:.1} CPU s"));
     let outputs = format!("{} and {}/", output.display(), export.display());
-    print::note(&match (is_new, ran) {
-        (true, _) => format!("wrote {outputs}"),
-        (false, 0) => format!("{} is up to date: nothing changed", output.display()),
-        (false, _) => format!("{outputs} stay as they are: the scene is the same"),
+    print::note(&match (written, ran) {
+        (Written::Anew, _) => format!("wrote {outputs}"),
+        (Written::AsBefore, 0) => format!("{} is up to date: nothing changed", output.display()),
+        (Written::AsBefore, _) => format!("{outputs} stay as they are: the scene is the same"),
+        (Written::Nothing, _) => format!("{outputs} stay as they were: there is no scene to replace them"),
     });
-    Ok(if scene.main().is_some() { Answer::Done } else { Answer::Negative })
+    let answer = if scene.main().is_some() { Answer::Done } else { Answer::Negative };
+    Ok(BuiltScene { scene, images, answer })
+}
+
+/// What became of the files that were there before a build.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Written {
+    /// They are of the scene that was built.
+    Anew,
+    /// The same scene was built.
+    AsBefore,
+    /// Nothing was registered, and they stay.
+    Nothing,
+}
+
+/// The file that a build would replace.
+struct FileBefore {
+    hash: ContentHash,
+    /// Whether it is anything but a scene without images.
+    is_of_use: bool,
+}
+
+impl FileBefore {
+    /// Reads it, if it is there.
+    ///
+    /// # Errors
+    /// When it is a scene that has grown: no build has what it has grown by.
+    fn read(output: &Path) -> Result<Option<Self>> {
+        let Ok(bytes) = std::fs::read(output) else { return Ok(None) };
+        let scene: Option<SceneFile> = codec::decode(&bytes).ok();
+        let grown = scene.as_ref().map_or(0, |scene| scene.grown.len());
+        if grown > 0 {
+            return Err(Hinted::error(
+                format!("{} has grown by {grown} photos, which a build would lose", output.display()),
+                "name another file with -o, or remove this one",
+            ));
+        }
+        let is_of_use = scene.is_none_or(|scene| scene.main().is_some());
+        Ok(Some(Self { hash: ContentHash::of(&bytes), is_of_use }))
+    }
 }
 
 /// Says what the scene is, and what of it is not in all places where it might be sought.
-fn tell(scene: &SceneFile, folder: &ImageFolder, export: &Path) {
-    summarize(scene, folder.images.len() + folder.skipped.len());
+fn tell(scene: &SceneFile, folder: &ImageFolder, images: usize, export: &Path) {
+    summarize(scene, images);
     told_by_scene(folder, scene).estimated_cameras().iter().for_each(|line| print::note(line));
     if let Some(lack) = scene.main().and_then(colmap_lacks) {
         print::note(&format!("warning: no COLMAP model is written: {lack}"));

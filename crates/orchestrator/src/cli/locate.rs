@@ -37,19 +37,37 @@ const PHOTO_COLOR: [u8; 3] = [240, 150, 0];
 
 /// `setloc locate`
 pub fn run(args: &LocateArgs) -> Result<Answer> {
-    let (scene, located, answer) = locate_photos(args)?;
+    let LocatedPhotos { scene, located, answer, .. } = locate_photos(args)?;
     for (method, photo) in located.answers() {
         print::data(&line(method, photo, &scene))?;
     }
     Ok(answer)
 }
 
-/// Locates the photos and writes the output folder; the answer is negative when the target is not localized.
-pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answer)> {
+/// What the localization of some photos came to.
+pub struct LocatedPhotos {
+    /// What they are located in.
+    pub scene: Arc<SceneFile>,
+    pub located: Located,
+    /// Name of the photo that matters.
+    pub target: String,
+    /// Negative when that is not localized.
+    pub answer: Answer,
+}
+
+/// Locates the photos and writes the output folder.
+pub fn locate_photos(args: &LocateArgs) -> Result<LocatedPhotos> {
     let config = args.run.config()?;
     let scene = SceneFile::read(&args.scene)?;
     let files = list_images(&args.photos)?;
     refuse_inputs(args, &files)?;
+    if scene.main().is_none() {
+        let hint = "build it of panoramas that share more, 3 to 10 m apart";
+        return Err(Hinted::error(
+            format!("{} has no images to locate photos by", args.scene.display()),
+            hint,
+        ));
+    }
     let target = find_target(args.target.as_deref(), &files)?;
     let cameras = args.cameras.as_deref().map(CameraBook::read).transpose()?.unwrap_or_default();
     let masks = args.masks.as_deref();
@@ -98,7 +116,8 @@ pub fn locate_photos(args: &LocateArgs) -> Result<(Arc<SceneFile>, Located, Answ
         Some(output) => write_grown((output, &book), &session, &photos, &what, (&target, &located))?,
         None => true,
     };
-    Ok((what.scene, located, if found && grown { Answer::Done } else { Answer::Negative }))
+    let answer = if found && grown { Answer::Done } else { Answer::Negative };
+    Ok(LocatedPhotos { scene: what.scene, located, target, answer })
 }
 
 /// The photos with the cameras of their answers, where these tell what was a guess.

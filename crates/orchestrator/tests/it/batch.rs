@@ -48,24 +48,44 @@ fn a_failing_scene_does_not_stop_the_others() {
         [[scene]]
         name = "apart"
         panoramas = ["panoramas"]
+          [[scene.sets]]
+          name = "nowhere"
+          photos = ["town/queries/lane"]
         "#,
     );
     let output = setloc(folder.path(), &["batch", "batch.toml", "-o", "out"]);
     assert_eq!(output.status.code(), Some(2), "{}", said(&output));
     let lines = summary(&gave(&output));
     let names: Vec<&str> = lines.iter().map(|(name, _)| name.as_str()).collect();
-    assert_eq!(names, ["broken", "broken/never", "town", "town/gone", "town/lane", "apart"]);
+    assert_eq!(names, ["broken", "broken/never", "town", "town/gone", "town/lane", "apart", "apart/nowhere"]);
     assert!(lines[0].1.starts_with("failed: ") && lines[0].1.contains("broken/a.jpg"), "{lines:?}");
     assert_eq!((lines[1].1.as_str(), lines[2].1.as_str()), ("skipped", "done"));
     assert!(lines[3].1.starts_with("failed: ") && lines[3].1.contains("nowhere"), "{lines:?}");
     assert!(["done", "negative"].contains(&lines[4].1.as_str()), "{lines:?}");
     // Pictures of nothing in common are no scene, which is an answer.
-    assert_eq!(lines[5].1, "negative");
+    assert_eq!((lines[5].1.as_str(), lines[6].1.as_str()), ("negative", "skipped"));
     assert!(folder.path().join("out/town/lane/poses.json").is_file());
     let written = std::fs::read_to_string(folder.path().join("out/summary.json")).unwrap();
     let written: serde_json::Value = serde_json::from_str(&written).unwrap();
-    assert_eq!(written.as_array().unwrap().len(), 6);
-    assert_eq!(written[2]["outcome"], "done");
+    assert_eq!(written.as_array().unwrap().len(), 7);
+    let [town, gone, lane, apart] = [2, 3, 4, 5].map(|at| &written[at]);
+    assert_eq!((&town["outcome"], &town["scene"]), (&"done".into(), &"out/town/scene.setloc".into()));
+    let figures = |part: &serde_json::Value, keys: [&str; 4]| keys.map(|key| part[key].as_u64());
+    let of_scene = ["images", "registered", "in_largest", "components"];
+    assert_eq!(figures(town, of_scene), [4, 4, 4, 1].map(Some));
+    assert_eq!(figures(apart, of_scene), [2, 0, 0, 0].map(Some));
+    assert_eq!(figures(gone, of_scene), [None; 4]);
+    let [photos, localized, uncertain, lost] =
+        figures(lane, ["photos", "localized", "uncertain", "not_localized"]);
+    assert!(
+        photos == Some(4) && [localized, uncertain, lost].into_iter().flatten().sum::<u64>() == 4,
+        "{lane}"
+    );
+    assert_eq!(
+        (&lane["results"], &lane["target"]["name"]),
+        (&"out/town/lane".into(), &"lane/img_03.jpg".into())
+    );
+    assert!(lane["target"]["verdict"].is_string() && lane["target"]["sigma"].is_object(), "{lane}");
 }
 
 #[test]

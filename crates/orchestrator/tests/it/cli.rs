@@ -228,9 +228,40 @@ fn a_scene_grows_by_localized_photos_and_says_so() {
     // The same again is the same, and what it has grown by it does not grow by again.
     assert_eq!(grow("s.setloc", "h.setloc").status.code(), Some(0));
     assert_eq!(std::fs::read(folder.path().join("h.setloc")).unwrap(), file);
+    let lost = run(&["build", "town/panoramas", "-o", "g.setloc"]);
+    assert_eq!(lost.status.code(), Some(2), "{}", said(&lost));
+    assert!(
+        said(&lost).contains("g.setloc has grown by ") && said(&lost).contains("hint: "),
+        "{}",
+        said(&lost)
+    );
+    assert_eq!(std::fs::read(folder.path().join("g.setloc")).unwrap(), file);
     let again = grow("g.setloc", "i.setloc");
     assert_eq!(again.status.code(), Some(1), "{}", said(&again));
     assert!(said(&again).contains("all photos that are localized are in the scene"), "{}", said(&again));
+}
+
+#[test]
+fn where_nothing_is_registered_a_scene_stays_and_none_is_located_in() {
+    let folder = tempfile::tempdir().unwrap();
+    town(folder.path());
+    panoramas(folder.path(), 2);
+    let run = |arguments: &[&str]| setloc(folder.path(), arguments);
+    let build = run(&["build", "town/panoramas", "-o", "s.setloc"]);
+    assert_eq!(build.status.code(), Some(0), "{}", said(&build));
+    let files = ["s.setloc", "s.images.json", "s/poses.json", "s/report.json"];
+    let contents = || files.map(|name| std::fs::read(folder.path().join(name)).unwrap());
+    let before = contents();
+    let foreign = run(&["build", "panoramas", "-o", "s.setloc"]);
+    assert_eq!(foreign.status.code(), Some(1), "{}", said(&foreign));
+    assert!(said(&foreign).contains("s.setloc and s/ stay as they were"), "{}", said(&foreign));
+    assert!(contents() == before);
+
+    let empty = run(&["build", "panoramas", "-o", "e.setloc"]);
+    assert_eq!(empty.status.code(), Some(1), "{}", said(&empty));
+    let located = run(&["locate", "e.setloc", "town/queries/lane"]);
+    assert_eq!(located.status.code(), Some(2), "{}", said(&located));
+    assert!(said(&located).contains("error: e.setloc has no images"), "{}", said(&located));
 }
 
 #[test]
