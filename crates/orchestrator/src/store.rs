@@ -498,6 +498,17 @@ pub fn create_folder(path: &Path) -> Result<()> {
     fs::create_dir_all(path).map_err(|e| write_error(e, path))
 }
 
+/// Whether nothing may be written in a folder, be it there or to be made: for its permissions, or as all of its disk.
+pub fn refuses_writes(folder: &Path) -> bool {
+    let written = fs::create_dir_all(folder)
+        .and_then(|()| tempfile::Builder::new().prefix(TEMPORARY).tempfile_in(folder));
+    written.is_err_and(|error| is_refusal(error.kind()))
+}
+
+fn is_refusal(kind: ErrorKind) -> bool {
+    matches!(kind, ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem)
+}
+
 /// Writes a file so that readers see the old one, or the new one whole, whatever happens.
 ///
 /// # Errors
@@ -538,7 +549,7 @@ pub fn write_error(error: std::io::Error, path: &Path) -> anyhow::Error {
         ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
             "make space and run the same command again: everything finished is kept"
         }
-        ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => {
+        kind if is_refusal(kind) => {
             "choose a writable folder with --cache DIR or SETLOC_CACHE, or another -o"
         }
         _ => "check that the folder exists and can be written",

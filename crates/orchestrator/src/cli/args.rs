@@ -11,7 +11,9 @@ use crate::bench::BenchGps;
 use crate::config::Config;
 use crate::dataset::{CameraBook, GeoSource};
 use crate::locating::Mode;
+use crate::print;
 use crate::session::{Limits, Session, cache_folder, stop_on_signal};
+use crate::store::refuses_writes;
 
 /// Localizes photos in a place that street-view panoramas have mapped.
 #[derive(Debug, Parser)]
@@ -88,7 +90,8 @@ pub struct RunArgs {
     /// Memory for the jobs' work, as `8GiB` [default: three quarters of the machine's]
     #[arg(long, value_parser = parse_bytes)]
     pub memory: Option<u64>,
-    /// Folder of stored results [default: `.setloc-cache` beside the output]
+    /// Folder of stored results [default: `.setloc-cache` beside the output; of `locate` beside the scene, or beside the output
+    /// where that cannot be written]
     #[arg(long, value_name = "DIR", env = "SETLOC_CACHE")]
     pub cache: Option<PathBuf>,
 }
@@ -97,6 +100,20 @@ impl RunArgs {
     /// The configuration.
     pub fn config(&self) -> Result<Config> {
         Config::resolve(self.config.as_deref(), &self.settings)
+    }
+
+    /// Beside which of the two the store is where no option says: beside the other where it cannot be written beside the first.
+    pub fn kept_beside<'p>(&self, first: &'p Path, other: &'p Path) -> &'p Path {
+        let [folder, kept] = [first, other].map(|output| cache_folder(None, output));
+        if self.cache.is_some() || folder == kept || !refuses_writes(&folder) {
+            return first;
+        }
+        print::note(&format!(
+            "note: {} cannot be written: results are kept in {}",
+            folder.display(),
+            kept.display()
+        ));
+        other
     }
 
     /// Opens the store; the log is a file in `log_folder`.

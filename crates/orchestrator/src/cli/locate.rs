@@ -78,7 +78,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<LocatedPhotos> {
     }
     remark(&photos);
     // Results of photos are kept beside the scene, where those of its images are.
-    let session = args.run.session(&args.scene, Some(&args.output))?;
+    let session = args.run.session(args.run.kept_beside(&args.scene, &args.output), Some(&args.output))?;
     let book = PictureBook::read(&args.scene)?;
     let pictures = Arc::new(book.at_hand());
     let what = LocateJobs { scene: Arc::new(scene), pictures, config, seed: args.run.seed };

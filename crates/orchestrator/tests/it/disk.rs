@@ -63,3 +63,17 @@ fn a_read_only_store_is_named_but_enough_when_nothing_is_to_be_done() {
     assert!(changed.contains("error: cannot write store/") && changed.contains("Read-only"), "{text}");
     assert!(changed.contains("hint: choose a writable folder") && changed.contains("exit code 2"), "{text}");
 }
+
+#[test]
+fn photos_are_located_in_a_scene_on_a_disk_that_cannot_be_written() {
+    let folder = tempfile::tempdir().unwrap();
+    town(folder.path());
+    let script = "build; cp s.setloc store/t.setloc; mount -o remount,ro store; unset SETLOC_CACHE
+        $SETLOC locate store/t.setloc town/queries/lane -o out/lane --mode single || echo \"exit code $?\" >&2
+        ls out/lane/poses.json out/.setloc-cache >&2";
+    let Some(output) = with_small_disk(folder.path(), "200m", script) else { return };
+    let text = said(&output);
+    let note = "note: store/.setloc-cache cannot be written: results are kept in out/.setloc-cache";
+    assert!(text.contains(note) && !text.contains("exit code 2"), "{text}");
+    assert!(text.contains("out/lane/poses.json\n") && text.contains("objects"), "{text}");
+}
