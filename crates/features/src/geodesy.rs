@@ -1,4 +1,4 @@
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::GeoPosition;
@@ -38,6 +38,13 @@ impl Wgs84 {
     /// East, north, up in metres about `origin`.
     pub fn to_enu(self, origin: Self) -> Vector3<f64> {
         origin.enu_from_ecef() * (self.to_ecef() - origin.to_ecef())
+    }
+
+    /// Rotation and translation that bring east, north, up about another place to those about this one.
+    pub fn enu_from_enu_of(self, other: Self) -> (UnitQuaternion<f64>, Vector3<f64>) {
+        let rotation = self.enu_from_ecef() * other.enu_from_ecef().transpose();
+        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+        (rotation, other.to_enu(self))
     }
 
     /// The place of a point given east, north, up in metres about `origin`.
@@ -100,6 +107,16 @@ mod tests {
             assert!((back.lat - lat).abs() < 1e-10 && (back.lon + 71.3).abs() < 1e-10);
             assert!((back.alt - 35.0).abs() < 1e-6);
         }
+    }
+
+    #[test]
+    fn places_about_one_origin_are_the_same_about_another() {
+        let [here, there] =
+            [(47.37, 8.54, 400.0), (-33.9, 151.2, 20.0)].map(|(lat, lon, alt)| Wgs84 { lat, lon, alt });
+        let place = Wgs84 { lat: 46.9, lon: 7.4, alt: 700.0 };
+        let (rotation, translation) = here.enu_from_enu_of(there);
+        let moved = rotation * place.to_enu(there) + translation;
+        assert!((moved - place.to_enu(here)).norm() < 1e-6, "{moved}");
     }
 
     #[test]

@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use setloc_features::Camera;
 use setloc_sfm::Rigid;
 
-pub use self::poses::read_poses;
+pub use self::poses::{NamedPoses, read_poses};
 
 use crate::error::Hinted;
 use crate::export::pose_json;

@@ -300,7 +300,7 @@ pub struct CompareArgs {
     /// Align by the images whose true name starts so, as `panoramas/`, and judge the others [default: by all, and judge all]
     #[arg(long, value_name = "PREFIX", conflicts_with = "no_align")]
     pub align_by: Option<String>,
-    /// Poses are in the truth's frame
+    /// Poses are in the truth's frame, or both east, north, up about a `geo_origin` that each states
     #[arg(long)]
     pub no_align: bool,
     /// File for all figures and each image's errors (JSON)

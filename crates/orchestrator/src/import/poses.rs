@@ -7,12 +7,35 @@ use anyhow::{Context, Result};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 use setloc_camset::Verdict;
+use setloc_features::GeoPosition;
 use setloc_sfm::Rigid;
 
 use super::ColmapFormat;
 use super::colmap_text::is_content;
-use crate::dataset::{Truth, rigid_of};
+use crate::dataset::rigid_of;
 use crate::error::Hinted;
+
+/// Poses of images by name.
+#[derive(Debug, Clone, Default)]
+pub struct NamedPoses {
+    /// `world_from_camera`.
+    pub poses: BTreeMap<String, Rigid>,
+    /// Where the world's origin is on the map, its axes east, north, up there; where that is told.
+    pub origin: Option<GeoPosition>,
+}
+
+impl NamedPoses {
+    /// The same in the frame of other poses, and how far their origins are apart; `None` where either origin is not told. Where one has
+    /// no altitude both are at one.
+    pub fn in_frame_of(&self, other: &Self) -> Option<(Self, f64)> {
+        let (own, wanted) = (self.origin?, other.origin?);
+        let altitude = own.alt_m.or(wanted.alt_m).unwrap_or(0.0);
+        let (rotation, translation) = wanted.or_at(altitude).enu_from_enu_of(own.or_at(altitude));
+        let enu_from_enu = Rigid::new(rotation, translation);
+        let poses = self.poses.iter().map(|(name, pose)| (name.clone(), enu_from_enu * *pose)).collect();
+        Some((Self { poses, origin: other.origin }, translation.norm()))
+    }
+}
 
 /// Reads `world_from_camera` of images by name.
 ///
@@ -22,15 +45,22 @@ use crate::error::Hinted;
 ///
 /// # Errors
 /// With file and place.
-pub fn read_poses(path: &Path) -> Result<BTreeMap<String, Rigid>> {
+pub fn read_poses(path: &Path) -> Result<NamedPoses> {
+    let mut origin = None;
     let poses = if path.is_dir() {
-        of_folder(path)?
+        let truth = path.join("truth.json");
+        if truth.is_file() {
+            return read_poses(&truth);
+        }
+        let images = ColmapFormat::of(path)?.images(path, |_| Ok(()))?;
+        images.into_iter().map(|(name, (_, pose))| (name, pose)).collect()
     } else {
         let text =
             std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
         if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
             let json: Value =
                 serde_json::from_str(&text).with_context(|| format!("{} is no JSON", path.display()))?;
+            origin = origin_of(&json["geo_origin"]).with_context(|| path.display().to_string())?;
             of_json(&json).with_context(|| path.display().to_string())?
         } else {
             of_lines(path, &text)?
@@ -43,16 +73,24 @@ pub fn read_poses(path: &Path) -> Result<BTreeMap<String, Rigid>> {
             "name a truth.json, a poses.json, a COLMAP model or lines of poses",
         ));
     }
-    Ok(poses)
+    Ok(NamedPoses { poses, origin })
 }
 
-fn of_folder(folder: &Path) -> Result<BTreeMap<String, Rigid>> {
-    let truth = folder.join("truth.json");
-    if truth.is_file() {
-        return Ok(Truth::read(&truth)?.poses(""));
+/// `{"lat", "lon", "alt"}`, without an altitude where none was measured; `None` of null.
+fn origin_of(value: &Value) -> Result<Option<GeoPosition>> {
+    if value.is_null() {
+        return Ok(None);
     }
-    let images = ColmapFormat::of(folder)?.images(folder, |_| Ok(()))?;
-    Ok(images.into_iter().map(|(name, (_, pose))| (name, pose)).collect())
+    let number = |key: &str| value[key].as_f64();
+    let place = number("lat").zip(number("lon")).map(|(lat_deg, lon_deg)| GeoPosition {
+        lat_deg,
+        lon_deg,
+        alt_m: number("alt"),
+    });
+    let place = place.filter(GeoPosition::is_valid);
+    Ok(Some(
+        place.context("`geo_origin` is no place: it has `lat` and `lon` in degrees, and `alt` in metres")?,
+    ))
 }
 
 /// `NAME QW QX QY QZ TX TY TZ`, the pose camera-from-world.
@@ -155,9 +193,11 @@ fn numbers<const N: usize>(value: &Value) -> Option<[f64; N]> {
 
 #[cfg(test)]
 mod tests {
+    use setloc_features::Wgs84;
+
     use super::*;
 
-    fn read(name: &str, text: &str) -> Result<BTreeMap<String, Rigid>> {
+    fn read(name: &str, text: &str) -> Result<NamedPoses> {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join(name), text).unwrap();
         read_poses(&folder.path().join(name))
@@ -185,13 +225,42 @@ mod tests {
             ("bench.json", r#"{"a b.jpg": {"R": [[-1,0,0],[0,1,0],[0,0,-1]], "C": [1,2,3]}}"#.to_owned()),
         ];
         for (name, text) in texts {
-            let poses = read(name, &text).unwrap();
+            let poses = read(name, &text).unwrap().poses;
             assert_eq!(poses.keys().collect::<Vec<_>>(), ["a b.jpg"], "{name}");
             let pose = poses["a b.jpg"];
             assert!((pose.translation - Vector3::new(1.0, 2.0, 3.0)).norm() < 1e-12, "{name}: {pose:?}");
             let turned = pose.rotation * Vector3::new(1.0, 1.0, 1.0);
             assert!((turned - Vector3::new(-1.0, 1.0, -1.0)).norm() < 1e-12, "{name}: {pose:?}");
         }
+    }
+
+    #[test]
+    fn poses_about_another_origin_come_into_the_frame_of_the_others() {
+        let (zurich, bern) = ((47.37, 8.54), (46.95, 7.45));
+        let place = |lat: f64, lon: f64, alt: f64| Wgs84 { lat, lon, alt };
+        let seen = place(47.0, 8.0, 500.0);
+        let written = |(lat, lon): (f64, f64), with_altitude: bool| {
+            let center = seen.to_enu(place(lat, lon, 400.0));
+            let alt = if with_altitude { ", \"alt\": 400.0" } else { "" };
+            let text = format!(
+                r#"{{"geo_origin": {{"lat": {lat}, "lon": {lon}{alt}}}, "images": {{"a": {{"q_wxyz": [1, 0, 0, 0], "center": [{}, {}, {}]}}}}}}"#,
+                center.x, center.y, center.z
+            );
+            read("truth.json", &text).unwrap()
+        };
+        let truth = written(zurich, true);
+        for found in [written(bern, true), written(bern, false)] {
+            let (moved, distance_m) = found.in_frame_of(&truth).unwrap();
+            let off = moved.poses["a"].translation - truth.poses["a"].translation;
+            assert!(off.norm() < 1e-6 && (9e4..1e5).contains(&distance_m), "{off} {distance_m}");
+            // Meridians turn between the two.
+            let turned = moved.poses["a"].rotation.angle_to(&truth.poses["a"].rotation).to_degrees();
+            assert!((0.7..1.2).contains(&turned), "{turned}");
+        }
+        let without = NamedPoses { origin: None, ..truth.clone() };
+        assert!(without.in_frame_of(&truth).is_none() && truth.in_frame_of(&without).is_none());
+        let error = read("a.json", r#"{"geo_origin": {"lat": 91, "lon": 8}, "images": {}}"#).unwrap_err();
+        assert!(format!("{error:#}").contains("a.json: `geo_origin` is no place"), "{error:#}");
     }
 
     #[test]

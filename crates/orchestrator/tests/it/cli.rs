@@ -322,4 +322,21 @@ fn poses_are_compared_with_the_truth() {
     let found: serde_json::Value =
         serde_json::from_slice(&std::fs::read(folder.path().join("found.json")).unwrap()).unwrap();
     assert!((found["comparisons"][0]["scale"].as_f64().unwrap() - 2.0).abs() < 1e-9, "{found}");
+
+    // East, north, up of two origins, one a thousandth of a degree north of the other.
+    let about = |lat: &str, north: f64| {
+        let pose = |x: i32| format!(r#"{{"q_wxyz": [1, 0, 0, 0], "center": [{x}, {north}, 0]}}"#);
+        let origin = format!(r#"{{"lat": {lat}, "lon": 8.0, "alt": 400.0}}"#);
+        format!(r#"{{"geo_origin": {origin}, "images": {{"a": {}, "b": {}}}}}"#, pose(0), pose(5))
+    };
+    write("here.json", &about("47.0", 111.18));
+    write("there.json", &about("47.001", 0.0));
+    let output = setloc(folder.path(), &["compare", "here.json", "there.json", "--no-align"]);
+    let row = gave(&output).lines().nth(2).unwrap_or_default().to_owned();
+    assert!(row.starts_with("| there.json | 2/2 | 0 | 0.0"), "{row} {}", said(&output));
+    assert!(
+        said(&output).contains("there.json: brought to the truth's geo_origin, 111.1"),
+        "{}",
+        said(&output)
+    );
 }
