@@ -1,7 +1,9 @@
 //! Models and poses of other programs.
 
+mod cameras;
 mod colmap_binary;
 mod colmap_text;
+mod located;
 mod poses;
 
 use std::collections::BTreeMap;
@@ -12,8 +14,11 @@ use serde_json::{Value, json};
 use setloc_features::Camera;
 use setloc_sfm::Rigid;
 
+pub use self::located::LocatedPhotos;
 pub use self::poses::{NamedPoses, read_poses};
 
+use self::cameras::ColmapCamera;
+use crate::colmap::ColmapFormat;
 use crate::error::Hinted;
 use crate::export::pose_json;
 
@@ -23,8 +28,10 @@ type Images = BTreeMap<String, (u32, Rigid)>;
 /// Cameras and poses of a model.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ImportedModel {
-    /// Cameras by their number in the model.
+    /// Cameras by their number in the model, of those whose model is known here.
     pub cameras: BTreeMap<u32, Camera>,
+    /// Names of the other cameras' models, by the cameras' numbers.
+    pub foreign: BTreeMap<u32, &'static str>,
     /// Camera number and pose (`world_from_camera`) by image name.
     pub images: BTreeMap<String, (u32, Rigid)>,
 }
@@ -46,14 +53,32 @@ impl ImportedModel {
             anyhow::ensure!(cameras.contains_key(&camera), "{file} has no camera {camera}");
             Ok(())
         })?;
-        Ok(Self { cameras, images })
+        let mut model = Self { images, ..Self::default() };
+        for (number, camera) in cameras {
+            match camera {
+                ColmapCamera::Known(camera) => {
+                    model.cameras.insert(number, camera);
+                }
+                ColmapCamera::Foreign(name) => {
+                    model.foreign.insert(number, name);
+                }
+            }
+        }
+        Ok(model)
     }
 
-    /// As `cameras.json`; `prefix` is put before the images' names.
+    /// Names of the images whose cameras are not known here.
+    pub fn without_camera(&self) -> impl Iterator<Item = &str> {
+        let is_foreign = |(_, (number, _)): &(&String, &(u32, Rigid))| self.foreign.contains_key(number);
+        self.images.iter().filter(is_foreign).map(|(name, _)| name.as_str())
+    }
+
+    /// As `cameras.json`, without cameras that are not known here and their images; `prefix` is put before the images' names.
     pub fn to_cameras_json(&self, prefix: &str) -> Value {
         let images: BTreeMap<String, String> = self
             .images
             .iter()
+            .filter(|(_, (number, _))| self.cameras.contains_key(number))
             .map(|(name, (number, _))| (format!("{prefix}{name}"), number.to_string()))
             .collect();
         json!({ "cameras": self.cameras, "images": images })
@@ -68,13 +93,6 @@ impl ImportedModel {
             .collect();
         json!({ "images": images })
     }
-}
-
-/// How a COLMAP model is written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum ColmapFormat {
-    Binary,
-    Text,
 }
 
 impl ColmapFormat {
@@ -94,15 +112,6 @@ impl ColmapFormat {
             );
             Hinted::error(format!("{} has neither images.bin nor images.txt", folder.display()), hint)
         })
-    }
-
-    /// The file of a part of a model.
-    fn file(self, part: &str) -> String {
-        let extension = match self {
-            Self::Binary => "bin",
-            Self::Text => "txt",
-        };
-        format!("{part}.{extension}")
     }
 
     /// The images of the model in a folder, each of whose cameras is checked.
@@ -182,6 +191,21 @@ mod tests {
         assert!(
             error_of(good, "\n1 1 0 0 0 0 0 0 2 a.jpg\n").contains("line 2: cameras.txt has no camera 2")
         );
+    }
+
+    #[test]
+    fn poses_of_cameras_that_are_not_known_are_read_and_their_intrinsics_left_out() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+        write("cameras.txt", "1 SIMPLE_PINHOLE 640 480 500 320 240\n2 FOV 640 480 500 500 320 240 0.9\n");
+        write("images.txt", "1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 0 0 0 2 b.jpg\n\n");
+        let read = ImportedModel::read_colmap(folder.path()).unwrap();
+        assert_eq!(read.foreign, BTreeMap::from([(2, "FOV")]));
+        assert_eq!(read.without_camera().collect::<Vec<_>>(), ["b.jpg"]);
+        let cameras = read.to_cameras_json("");
+        assert_eq!(cameras["images"], json!({ "a.jpg": "1" }));
+        assert_eq!(cameras["cameras"].as_object().unwrap().keys().collect::<Vec<_>>(), ["1"]);
+        assert_eq!(read.to_truth_json("")["images"].as_object().unwrap().len(), 2);
     }
 
     #[test]

@@ -15,8 +15,8 @@ mod positions;
 mod scene;
 mod scene_file;
 
-pub use features::add_features_of;
-pub use grow::{LocatedJobs, add_grown};
+pub use features::{add_features_of, features_role};
+pub use grow::{GROWN_KIND, LocatedJobs, SCENE_INPUT, add_grown};
 pub use likely::LikelyJobs;
 pub use locate::{LocateJobs, SetJobs, SingleJobs, add_set, add_singles};
 pub use matching::{PairSource, add_turned};
@@ -24,7 +24,7 @@ pub use model::{ModelJobs, ModelKind, add_model, divided_guesses};
 pub use pairs::choose_pairs;
 pub use positions::how_fixed;
 pub use scene::{
-    ApartJob, SceneInputs, SceneJobs, SceneModelJobs, add_first_model, add_model_apart, add_scene,
+    ApartJob, SCENE_KIND, SceneInputs, SceneJobs, SceneModelJobs, add_first_model, add_model_apart, add_scene,
 };
 
 use crate::fingerprint::ContentHash;

@@ -84,11 +84,20 @@ impl SceneFile {
     /// # Errors
     /// When it is missing, damaged or no scene.
     pub fn read(path: &Path) -> Result<Self> {
+        Ok(Self::read_with_hash(path)?.0)
+    }
+
+    /// The same with the hash of the file.
+    ///
+    /// # Errors
+    /// As [`SceneFile::read`].
+    pub fn read_with_hash(path: &Path) -> Result<(Self, ContentHash)> {
         let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-        codec::decode(&bytes).map_err(|error| {
+        let scene = codec::decode(&bytes).map_err(|error| {
             let error = anyhow::Error::new(error).context(format!("{} is no usable scene", path.display()));
             Hinted::wrap(error, "build it again with `setloc build PANORAMAS -o scene.setloc`")
-        })
+        })?;
+        Ok((scene, ContentHash::of(&bytes)))
     }
 
     /// Names of the images that are photos which it has grown by.

@@ -118,12 +118,23 @@ impl Store {
             }
             object => object,
         };
-        let bytes = bytes.with_context(|| format!("cannot read artifact {hash}"))?;
-        anyhow::ensure!(
-            ContentHash::of(&bytes) == hash,
-            "artifact {hash} is damaged: its content has another hash"
-        );
-        Ok(bytes)
+        verified(bytes, hash)
+    }
+
+    /// An output's file that is an object, as all but small ones are, its hash verified.
+    ///
+    /// # Errors
+    /// When it is missing, unreadable or damaged.
+    pub fn object(&self, hash: ContentHash) -> Result<Vec<u8>> {
+        verified(fs::read(self.object_path(hash)), hash)
+    }
+
+    /// All undamaged records of jobs of these kinds.
+    ///
+    /// # Errors
+    /// When the folder cannot be listed.
+    pub fn records_of(&self, kinds: &[&str]) -> Result<Vec<KeyRecord>> {
+        self.records.of_kinds(kinds)
     }
 
     /// Stores an artifact file and what it was made from; returns its content hash.
@@ -387,6 +398,16 @@ fn remove(path: &Path) -> Result<()> {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(write_error(error, path)),
         _ => Ok(()),
     }
+}
+
+/// The content of an artifact as it was read, if it has its hash.
+fn verified(bytes: std::io::Result<Vec<u8>>, hash: ContentHash) -> Result<Vec<u8>> {
+    let bytes = bytes.with_context(|| format!("cannot read artifact {hash}"))?;
+    anyhow::ensure!(
+        ContentHash::of(&bytes) == hash,
+        "artifact {hash} is damaged: its content has another hash"
+    );
+    Ok(bytes)
 }
 
 fn read_run(path: &Path) -> Option<RunRecord> {

@@ -62,7 +62,7 @@ pub enum Command {
     Report(ReportArgs),
     /// Show what is stored and what the last runs did
     Status(StatusArgs),
-    /// Write a scene in another format
+    /// Write a scene, or the photos localized in it, in another format
     Export(ExportArgs),
     /// Make cameras.json and truth.json of a COLMAP model, binary or text
     Import(ImportArgs),
@@ -293,7 +293,7 @@ pub struct RegistryArgs {
 pub struct CompareArgs {
     /// True poses, in any of these forms; images are known by name or by the end of it
     pub truth: PathBuf,
-    /// Of each program a truth.json (or a folder that has one), a poses.json of `build`, `locate` or `bench`, a COLMAP model's
+    /// Of each program a truth.json, a poses.json of `build`, `locate` or `bench` (or a folder that has one), a COLMAP model's
     /// folder, or lines of name and camera-from-world pose (qw qx qy qz tx ty tz)
     #[arg(required = true)]
     pub poses: Vec<PathBuf>,
@@ -335,7 +335,7 @@ pub struct DemoArgs {
 /// `setloc export`
 #[derive(Debug, Clone, Args)]
 pub struct ExportArgs {
-    /// The scene
+    /// The scene; or the folder of `locate`, of whose localized photos there are `geojson`, `kml` and `json`
     pub scene: PathBuf,
     /// The format
     #[arg(long, value_enum)]
@@ -346,12 +346,15 @@ pub struct ExportArgs {
     /// File, or folder for COLMAP [default: standard output]
     #[arg(short, long)]
     pub output: Option<PathBuf>,
+    /// Folder of stored results, for the 2D points of a COLMAP model [default: `.setloc-cache` beside the scene]
+    #[arg(long, value_name = "DIR", env = "SETLOC_CACHE")]
+    pub cache: Option<PathBuf>,
 }
 
 /// Formats of a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum ExportFormat {
-    /// COLMAP's text model (a folder)
+    /// COLMAP's binary model (a folder)
     Colmap,
     /// Point cloud
     Ply,

@@ -27,6 +27,7 @@ use crate::pictures::PictureBook;
 use crate::print;
 use crate::scene::SceneFile;
 use crate::session::{Session, cache_folder};
+use crate::sources::features_of;
 use crate::store::{RunRecord, Store, remove_files, write_atomically};
 use crate::turning::{TurnedJobs, guess_by_turns};
 
@@ -442,8 +443,7 @@ fn write_model(
     let markers = scene_markers(model, grown);
     let centres: Vec<_> =
         markers.iter().map(|marker| (marker.world_from_camera.translation, marker.color)).collect();
-    let features: Vec<Option<&ImageFeatures>> =
-        model.images.iter().map(|image| features.get(&image.name).map(|features| &**features)).collect();
+    let features = features_of(model, features);
     let writers: [&(dyn Fn() -> Result<()> + Sync); 3] = [
         // What COLMAP lacks is said when the scene is.
         &|| renew_colmap(&folder.join(COLMAP_MODEL), model, &features).map(drop),
@@ -498,9 +498,14 @@ fn note_remarks(report: &mut Value, scene: &SceneFile, skipped: &[SkippedImage],
     report["notes"] = serde_json::json!([&scene.notes[..], &images.estimated_cameras()].concat());
 }
 
-/// Readable JSON.
+/// Readable JSON, as a file.
 pub fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<()> {
-    write_atomically(path, (serde_json::to_string_pretty(value)? + "\n").as_bytes())
+    write_atomically(path, readable_json(value)?.as_bytes())
+}
+
+/// Readable JSON that ends as a file does.
+pub fn readable_json(value: &impl serde::Serialize) -> Result<String> {
+    Ok(serde_json::to_string_pretty(value)? + "\n")
 }
 
 /// Says what a scene is.

@@ -1,4 +1,3 @@
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -21,12 +20,14 @@ use crate::error::Hinted;
 use crate::export::{
     Marker, localizations_json, origin_json, ply, renew_colmap, scene_images_json, stated_sigma, top_view_png,
 };
+use crate::fingerprint::ContentHash;
 use crate::jobs::{LocateJobs, how_fixed};
 use crate::locating::{Located, Mode, grow, locate};
 use crate::pictures::PictureBook;
 use crate::print;
 use crate::scene::SceneFile;
 use crate::session::Session;
+use crate::sources::{features_of, missing_features, stored_features};
 use crate::store::{remove_files, write_atomically};
 use crate::text::apart;
 
@@ -34,6 +35,8 @@ use crate::text::apart;
 const TARGET_COLOR: [u8; 3] = [220, 30, 30];
 /// Orange, for the other photos.
 const PHOTO_COLOR: [u8; 3] = [240, 150, 0];
+/// Violet, for photos whose poses are uncertain, the target's too.
+const UNCERTAIN_COLOR: [u8; 3] = [150, 60, 200];
 
 /// `setloc locate`
 pub fn run(args: &LocateArgs) -> Result<Answer> {
@@ -58,7 +61,7 @@ pub struct LocatedPhotos {
 /// Locates the photos and writes the output folder.
 pub fn locate_photos(args: &LocateArgs) -> Result<LocatedPhotos> {
     let config = args.run.config()?;
-    let scene = SceneFile::read(&args.scene)?;
+    let (scene, scene_hash) = SceneFile::read_with_hash(&args.scene)?;
     let files = list_images(&args.photos)?;
     refuse_inputs(args, &files)?;
     if scene.main().is_none() {
@@ -94,7 +97,7 @@ pub fn locate_photos(args: &LocateArgs) -> Result<LocatedPhotos> {
     let answered = with_answered_cameras(&given, &located);
     let told = ImageFolder { images: given, ..photos.clone() }.once_told(answered);
     told.estimated_cameras().iter().for_each(|line| print::note(line));
-    write_results(&args.output, &located, (&what.scene, &target), &told, &session)?;
+    write_results(&args.output, &located, (&what.scene, scene_hash, &target), &told, &session)?;
     warn_skipped(&located.skipped);
     note_of_frame(&what.scene).iter().for_each(|note| print::note(&format!("note: {note}")));
     warn_of_scene(&what.scene.warnings);
@@ -196,7 +199,11 @@ fn write_grown(
     };
     let export = export_folder(output);
     write_atomically(output, &grown.file)?;
-    write_models(&export, &grown.scene, &BTreeMap::new())?;
+    let features = stored_features(&session.store, grown.hash)?;
+    write_models(&export, &grown.scene, &features)?;
+    if let Some(missing) = missing_features(&grown.scene.components, &features) {
+        print::note(&format!("note: {}: {missing}", export.display()));
+    }
     book.write(output)?;
     write_report(&export, (&grown.scene, grown.hash), &[], &ImageFolder::default(), session)?;
     let apart = located.answers().into_iter().map(|(_, photo)| photo);
@@ -265,7 +272,7 @@ fn line(method: &str, photo: &PhotoLocalization, scene: &SceneFile) -> String {
 fn write_results(
     folder: &Path,
     located: &Located,
-    (scene, target): (&SceneFile, &str),
+    (scene, scene_hash, target): (&SceneFile, ContentHash, &str),
     told: &ImageFolder,
     session: &Session,
 ) -> Result<()> {
@@ -297,33 +304,74 @@ fn write_results(
     let empty = Reconstruction::default();
     let model = scene.main().unwrap_or(&empty);
     let mut markers = scene_markers(model, &scene.grown_names());
-    let mut merged = model.clone();
-    for photo in &best {
-        // What has a frame of its own is in `poses.json` only.
-        let in_frame = photo.world_from_camera.filter(|_| scene.shares_frame(photo.component));
-        let Some(world_from_camera) = in_frame else { continue };
-        let color = if photo.name == target { TARGET_COLOR } else { PHOTO_COLOR };
-        markers.push(Marker { world_from_camera, color, directed: true });
-        let camera = CameraId(merged.cameras.len() as u32);
-        merged.cameras.push(photo.camera.clone());
-        // COLMAP knows images by their names.
-        let is_taken = |name: &String| merged.images.iter().any(|image| image.name == *name);
-        let mut free = std::iter::successors(Some(photo.name.clone()), |name| Some(format!("photos/{name}")));
-        let name = free.find(|name| !is_taken(name)).unwrap_or_default();
-        merged.images.push(ReconstructionImage { name, camera, world_from_camera: Some(world_from_camera) });
-    }
+    // What has a frame of its own is in `poses.json` only.
+    let in_frame: Vec<&PhotoLocalization> =
+        best.iter().filter(|photo| scene.shares_frame(photo.component)).collect();
+    markers.extend(in_frame.iter().filter_map(|photo| marker(photo, target)));
     let centres: Vec<_> =
         markers.iter().map(|marker| (marker.world_from_camera.translation, marker.color)).collect();
     write_atomically(&folder.join("points.ply"), ply(model, &centres).as_bytes())?;
-    if let Some(lack) = renew_colmap(&folder.join("colmap"), &merged, &[])? {
-        print::note(&format!("warning: no COLMAP model is written: {lack}"));
-    }
+    write_colmap_model(&folder.join("colmap"), (model, scene_hash), &in_frame, session)?;
     write_atomically(&folder.join(PICTURE), &top_view_png(model, &markers)?)?;
     let mut report = session.report.to_json();
     report["warnings"] = json!(told.warnings);
     let of_frame = note_of_frame(scene).into_iter();
     report["notes"] = json!(of_frame.chain(told.estimated_cameras()).collect::<Vec<_>>());
     write_json(&folder.join("report.json"), &report)
+}
+
+/// How a photo is shown in the point cloud and from above.
+fn marker(photo: &PhotoLocalization, target: &str) -> Option<Marker> {
+    let color = match photo.verdict {
+        Verdict::Localized if photo.name == target => TARGET_COLOR,
+        Verdict::Localized => PHOTO_COLOR,
+        _ => UNCERTAIN_COLOR,
+    };
+    photo.world_from_camera.map(|world_from_camera| Marker { world_from_camera, color, directed: true })
+}
+
+/// The COLMAP model of a scene, its images with their keypoints where these are stored, and of the photos that are localized in it;
+/// says what it lacks.
+fn write_colmap_model(
+    folder: &Path,
+    (scene, scene_hash): (&Reconstruction, ContentHash),
+    photos: &[&PhotoLocalization],
+    session: &Session,
+) -> Result<()> {
+    let merged = with_photos(scene, photos);
+    let features = stored_features(&session.store, scene_hash)?;
+    if let Some(lack) = renew_colmap(folder, &merged, &features_of(&merged, &features))? {
+        print::note(&format!("warning: no COLMAP model is written: {lack}"));
+        return Ok(());
+    }
+    let uncertain = photos.iter().filter(|photo| photo.verdict == Verdict::Uncertain);
+    let uncertain: Vec<&str> = uncertain.map(|photo| photo.name.as_str()).collect();
+    if !uncertain.is_empty() {
+        print::note(&format!("uncertain, and not in the COLMAP model: {}", listed(&uncertain, MOST_NAMED)));
+    }
+    if let Some(missing) = missing_features([scene], &features) {
+        print::note(&format!("note: {missing}"));
+    }
+    Ok(())
+}
+
+/// A scene with the photos that are localized in it; photos of one camera share it.
+fn with_photos(scene: &Reconstruction, photos: &[&PhotoLocalization]) -> Reconstruction {
+    let mut merged = scene.clone();
+    for photo in photos.iter().filter(|photo| photo.verdict == Verdict::Localized) {
+        let known = merged.cameras.iter().position(|camera| *camera == photo.camera);
+        let camera = known.unwrap_or_else(|| {
+            merged.cameras.push(photo.camera.clone());
+            merged.cameras.len() - 1
+        });
+        let camera = CameraId(camera as u32);
+        // COLMAP knows images by their names.
+        let is_taken = |name: &String| merged.images.iter().any(|image| image.name == *name);
+        let mut free = std::iter::successors(Some(photo.name.clone()), |name| Some(format!("photos/{name}")));
+        let name = free.find(|name| !is_taken(name)).unwrap_or_default();
+        merged.images.push(ReconstructionImage { name, camera, world_from_camera: photo.world_from_camera });
+    }
+    merged
 }
 
 #[cfg(test)]
@@ -371,6 +419,41 @@ mod tests {
         let line =
             |focal: &str, photo: &str| format!("focal length estimated with the scene: {focal} px: {photo}");
         assert_eq!(told.estimated_cameras(), [line("31.0", "a"), line("36.0", "c")]);
+    }
+
+    #[test]
+    fn a_model_has_the_photos_that_are_localized_and_each_camera_once() {
+        let camera = |focal| Camera::from_focal_guess(40, 30, focal);
+        let photo = |name: &str, verdict, focal| PhotoLocalization {
+            name: name.to_owned(),
+            camera: camera(focal),
+            component: 0,
+            world_from_camera: Some(Rigid::identity()),
+            covariance: None,
+            inliers: 0,
+            verdict,
+            reasons: Vec::new(),
+        };
+        let image = ReconstructionImage {
+            name: "a".to_owned(),
+            camera: CameraId(0),
+            world_from_camera: Some(Rigid::identity()),
+        };
+        let scene =
+            Reconstruction { cameras: vec![camera(31.0)], images: vec![image], ..Reconstruction::default() };
+        let photos = [
+            photo("a", Verdict::Localized, 32.0),
+            photo("b", Verdict::Localized, 32.0),
+            photo("c", Verdict::Uncertain, 33.0),
+            photo("d", Verdict::Localized, 31.0),
+        ];
+        let merged = with_photos(&scene, &photos.iter().collect::<Vec<_>>());
+        assert_eq!(merged.cameras, [camera(31.0), camera(32.0)]);
+        let images: Vec<(&str, u32)> =
+            merged.images.iter().map(|image| (image.name.as_str(), image.camera.0)).collect();
+        assert_eq!(images, [("a", 0), ("photos/a", 1), ("b", 1), ("d", 0)]);
+        let colors = photos.map(|photo| marker(&photo, "b").map(|marker| marker.color));
+        assert_eq!(colors, [PHOTO_COLOR, TARGET_COLOR, UNCERTAIN_COLOR, PHOTO_COLOR].map(Some));
     }
 
     #[test]

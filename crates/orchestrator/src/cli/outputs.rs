@@ -25,6 +25,17 @@ pub fn refuse_input<'p>(inputs: impl IntoIterator<Item = &'p Path>, output: &Pat
     }
 }
 
+/// Refuses a file to be written that is there with another content: a data set may have one of its own under that name.
+pub fn refuse_other_content(output: &Path, content: &[u8]) -> Result<()> {
+    match std::fs::read(output) {
+        Ok(present) if present != content => Err(Hinted::error(
+            format!("{} is there already, and not what would be written", output.display()),
+            "name another folder with -o, or remove the file",
+        )),
+        _ => Ok(()),
+    }
+}
+
 /// Refuses a folder where `option` names a file to be written; `example` is a file's name.
 pub fn refuse_folder(option: &str, output: &Path, example: &str) -> Result<()> {
     let ends_open = output.as_os_str().as_encoded_bytes().ends_with(b"/");
@@ -102,6 +113,17 @@ mod tests {
             assert_eq!(hint, format!("name a file in it: -o {}", output.join("scene.setloc").display()));
         }
         refuse_folder("-o", &root.path().join("new"), "scene.setloc").unwrap();
+    }
+
+    #[test]
+    fn a_file_with_another_content_is_refused_and_the_same_one_not() {
+        let root = tempfile::tempdir().unwrap();
+        let file = root.path().join("truth.json");
+        refuse_other_content(&file, b"new").unwrap();
+        std::fs::write(&file, "new").unwrap();
+        refuse_other_content(&file, b"new").unwrap();
+        let error = refuse_other_content(&file, b"newer").unwrap_err();
+        assert!(error.to_string().contains("truth.json is there already"), "{error}");
     }
 
     #[test]

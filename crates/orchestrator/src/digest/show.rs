@@ -46,7 +46,7 @@ impl Digest {
             add(
                 &mut body,
                 format_args!(
-                    "<h2>From above</h2>\n<p>Blue: the scene's images. Green: photos that it has grown by. Orange: photos. Red: the target. What is in a component with a frame of its own is not shown.</p><img alt='top view' src='data:image/png;base64,{}'>\n",
+                    "<h2>From above</h2>\n<p>Blue: the scene's images. Green: photos that it has grown by. Orange: photos. Red: the target. Violet: photos whose poses are uncertain. What is in a component with a frame of its own is not shown.</p><img alt='top view' src='data:image/png;base64,{}'>\n",
                     STANDARD.encode(png)
                 ),
             );

@@ -1,22 +1,21 @@
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt::Write;
 use std::path::Path;
 
 use anyhow::Result;
 use rayon::prelude::*;
 use setloc_features::{ImageFeatures, Keypoint};
-use setloc_sfm::{CameraId, Reconstruction, ReconstructionImage, ReconstructionPoint};
+use setloc_sfm::{CameraId, Observation, Reconstruction, ReconstructionImage, ReconstructionPoint};
 
+use crate::colmap::{BYTES_OF_POINT_2D, ColmapFormat, FURTHER_PARTS, NO_POINT, PARTS};
 use crate::error::Hinted;
 use crate::store::{remove_files, write_pieces_atomically};
 
-/// What a model consists of.
-const FILES: [&str; 3] = ["cameras.txt", "images.txt", "points3D.txt"];
-/// Points whose lines are made, and written, at once.
+/// Points whose records are made, and written, at once.
 const POINTS_OF_PIECE: usize = 2048;
-/// About what the lines of a point and of a keypoint take; more is made room for.
-const BYTES_OF_POINT: usize = 128;
-const BYTES_OF_KEYPOINT: usize = 26;
+/// About what the record of a point takes; more is made room for.
+const BYTES_OF_POINT: usize = 96;
+/// COLMAP's number of no camera model.
+const NO_MODEL: i32 = -1;
 
 /// What COLMAP's camera models cannot hold of a model's registered images; `None` when they hold all.
 pub fn colmap_lacks(model: &Reconstruction) -> Option<String> {
@@ -40,10 +39,11 @@ fn written_as(model: &Reconstruction, used: &BTreeSet<CameraId>) -> BTreeMap<Cam
     used.iter().map(|id| (*id, *first(id).filter(|_| is_stretched(id)).unwrap_or(id))).collect()
 }
 
-/// Writes a model as COLMAP's `cameras.txt`, `images.txt` and `points3D.txt`.
+/// Writes a model as COLMAP's `cameras.bin`, `images.bin` and `points3D.bin`, which hold any name and any number as it is; no other
+/// model is left in the folder, since programs read what they find first.
 ///
-/// Ids count from 1. COLMAP wants camera-from-world poses. `features[i]` belongs to image `i`; without it the line of
-/// 2D points stays empty, and tracks have no element in that image.
+/// Ids count from 1. COLMAP wants camera-from-world poses. `features[i]` belongs to image `i`; without it the image has no
+/// 2D points, and tracks have no element in that image.
 ///
 /// COLMAP has no stretched panoramas: they are written as plain ones, and their keypoints where such a one shows them. Those of one
 /// size then have one camera.
@@ -59,86 +59,99 @@ pub fn write_colmap(
         return Err(Hinted::error(lack, "`--format json` has every camera model"));
     }
     let used: BTreeSet<CameraId> = model.registered().map(|id| model.images[id.index()].camera).collect();
-    let mut cameras = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n");
     let written = written_as(model, &used);
-    for id in written.values().collect::<BTreeSet<_>>() {
-        let camera = model.cameras[id.index()].without_stretch();
-        let (name, width, height) = (camera.model.name(), camera.width, camera.height);
-        let params: Vec<String> = camera.params.iter().map(f64::to_string).collect();
-        writeln!(cameras, "{} {name} {width} {height} {}", id.0 + 1, params.join(" "))?;
-    }
-    // Keypoints that are written, and the point that each of them sees, 0 for none.
+    let cameras = camera_records(model, written.values().copied().collect());
+    // Keypoints that are written, and the point that each of them sees.
     let keypoints_of = |(at, image): (usize, &ReconstructionImage)| {
         let features = features.get(at).copied().flatten().filter(|_| image.world_from_camera.is_some());
         features.map_or(&[][..], |features| &features.keypoints)
     };
     let keypoints: Vec<&[Keypoint]> = model.images.iter().enumerate().map(keypoints_of).collect();
-    let mut seen: Vec<Vec<usize>> = keypoints.iter().map(|keypoints| vec![0; keypoints.len()]).collect();
+    let mut seen: Vec<Vec<u64>> = keypoints.iter().map(|keypoints| vec![NO_POINT; keypoints.len()]).collect();
     for (at, point) in model.points.iter().enumerate() {
         for observation in &point.track {
-            if let Some(id @ 0) = seen[observation.image.index()].get_mut(observation.feature as usize) {
-                *id = at + 1;
+            if let Some(id @ &mut NO_POINT) =
+                seen[observation.image.index()].get_mut(observation.feature as usize)
+            {
+                *id = at as u64 + 1;
             }
         }
     }
-    let points = |(piece, points): (usize, &[ReconstructionPoint])| -> Result<String, std::fmt::Error> {
-        let mut lines = String::with_capacity(points.len() * BYTES_OF_POINT);
+    let points = |(piece, points): (usize, &[ReconstructionPoint])| {
+        let mut records = Vec::with_capacity(points.len() * BYTES_OF_POINT);
         for (at, point) in points.iter().enumerate() {
-            let (p, [r, g, b]) = (point.position, point.color);
-            let id = piece * POINTS_OF_PIECE + at + 1;
-            write!(lines, "{id} {} {} {} {r} {g} {b} {:.4}", p.x, p.y, p.z, point.error_sigma)?;
-            for observation in &point.track {
-                if seen[observation.image.index()].get(observation.feature as usize) == Some(&id) {
-                    write!(lines, " {} {}", observation.image.0 + 1, observation.feature)?;
-                }
-            }
-            lines.push('\n');
+            add_point(&mut records, (piece * POINTS_OF_PIECE + at + 1) as u64, point, &seen);
         }
-        Ok(lines)
+        records
     };
-    let image = |(at, image): (usize, &ReconstructionImage)| -> Result<String, std::fmt::Error> {
-        let mut lines = String::with_capacity(512 + keypoints[at].len() * BYTES_OF_KEYPOINT);
-        let Some(pose) = image.world_from_camera else { return Ok(lines) };
+    let image = |(at, image): (usize, &ReconstructionImage)| {
+        let Some(pose) = image.world_from_camera else { return Vec::new() };
+        let mut record = Vec::with_capacity(256 + keypoints[at].len() * BYTES_OF_POINT_2D);
+        record.extend((at as u32 + 1).to_le_bytes());
         let camera_from_world = pose.inverse();
         let (q, t) = (camera_from_world.rotation.quaternion(), camera_from_world.translation);
-        let ids = format!("{} {}", written[&image.camera].0 + 1, image.name);
-        writeln!(lines, "{} {} {} {} {} {} {} {} {ids}", at + 1, q.w, q.i, q.j, q.k, t.x, t.y, t.z)?;
+        add_numbers(&mut record, [q.w, q.i, q.j, q.k, t.x, t.y, t.z]);
+        record.extend((written[&image.camera].0 + 1).to_le_bytes());
+        record.extend(image.name.bytes().chain([0]));
+        record.extend((keypoints[at].len() as u64).to_le_bytes());
         let camera = &model.cameras[image.camera.index()];
         let plain = camera.is_stretched().then(|| camera.without_stretch());
-        let place = |keypoint: &Keypoint| {
-            let shown = plain.as_ref().and_then(|plain| plain.project(&camera.unproject(&keypoint.pixel())?));
-            shown.map_or([keypoint.x, keypoint.y], |pixel| [pixel.x as f32, pixel.y as f32])
-        };
-        // Nearly all of the export: millions of numbers.
-        let mut number = zmij::Buffer::new();
         for (keypoint, point) in keypoints[at].iter().zip(&seen[at]) {
-            for coordinate in place(keypoint) {
-                lines.push_str(number.format(coordinate));
-                lines.push(' ');
-            }
-            match point {
-                0 => lines.push_str("-1 "),
-                id => write!(lines, "{id} ")?,
-            }
+            let shown = plain.as_ref().and_then(|plain| plain.project(&camera.unproject(&keypoint.pixel())?));
+            let place = shown.unwrap_or_else(|| keypoint.pixel());
+            add_numbers(&mut record, [place.x, place.y]);
+            record.extend(point.to_le_bytes());
         }
-        if !keypoints[at].is_empty() {
-            lines.pop();
-        }
-        lines.push('\n');
-        Ok(lines)
+        record
     };
-    let (points, images) = rayon::join(
-        || model.points.par_chunks(POINTS_OF_PIECE).enumerate().map(points).collect::<Result<Vec<_>, _>>(),
-        || model.images.par_iter().with_max_len(1).enumerate().map(image).collect::<Result<Vec<_>, _>>(),
+    let (points, images): (Vec<_>, Vec<_>) = rayon::join(
+        || model.points.par_chunks(POINTS_OF_PIECE).enumerate().map(points).collect(),
+        || model.images.par_iter().with_max_len(1).enumerate().map(image).collect(),
     );
-    let points_head = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n";
-    let images_head = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n\
-                       # POINTS2D[] as (X, Y, POINT3D_ID)\n";
-    let files = [(cameras.as_str(), Vec::new()), (images_head, images?), (points_head, points?)];
-    FILES.par_iter().zip(&files).with_max_len(1).try_for_each(|(name, (head, lines))| {
-        let pieces = std::iter::once(*head).chain(lines.iter().map(String::as_str));
-        write_pieces_atomically(&folder.join(name), pieces.map(str::as_bytes))
+    remove_colmap(folder)?;
+    let counts =
+        [written.values().collect::<BTreeSet<_>>().len(), model.registered().count(), model.points.len()];
+    let files: Vec<_> = PARTS.iter().zip(counts).zip([vec![cameras], images, points]).collect();
+    files.par_iter().with_max_len(1).try_for_each(|((part, count), records)| {
+        let count = (*count as u64).to_le_bytes();
+        let pieces = std::iter::once(&count[..]).chain(records.iter().map(Vec::as_slice));
+        write_pieces_atomically(&folder.join(ColmapFormat::Binary.file(part)), pieces)
     })
+}
+
+/// The records of `cameras.bin`.
+fn camera_records(model: &Reconstruction, cameras: BTreeSet<CameraId>) -> Vec<u8> {
+    let mut records = Vec::new();
+    for id in cameras {
+        let camera = model.cameras[id.index()].without_stretch();
+        records.extend((id.0 + 1).to_le_bytes());
+        // What COLMAP lacks is refused before.
+        records.extend(camera.model.colmap_id().unwrap_or(NO_MODEL).to_le_bytes());
+        records.extend([camera.width, camera.height].iter().flat_map(|side| u64::from(*side).to_le_bytes()));
+        add_numbers(&mut records, camera.params);
+    }
+    records
+}
+
+/// A point's record of `points3D.bin`; `seen` has the point that each keypoint of each image sees.
+fn add_point(records: &mut Vec<u8>, id: u64, point: &ReconstructionPoint, seen: &[Vec<u64>]) {
+    let (p, sees) = (point.position, |observation: &&Observation| {
+        seen[observation.image.index()].get(observation.feature as usize) == Some(&id)
+    });
+    records.extend(id.to_le_bytes());
+    add_numbers(records, [p.x, p.y, p.z]);
+    records.extend(point.color);
+    add_numbers(records, [point.error_sigma]);
+    let track = || point.track.iter().filter(sees);
+    records.extend((track().count() as u64).to_le_bytes());
+    for observation in track() {
+        records.extend((observation.image.0 + 1).to_le_bytes());
+        records.extend(observation.feature.to_le_bytes());
+    }
+}
+
+fn add_numbers(record: &mut Vec<u8>, numbers: impl IntoIterator<Item = f64>) {
+    record.extend(numbers.into_iter().flat_map(f64::to_le_bytes));
 }
 
 /// Writes a model as [`write_colmap`] does; what COLMAP lacks of it, and then no model of an earlier run is left either.
@@ -158,12 +171,16 @@ pub fn renew_colmap(
     Ok(Some(lack))
 }
 
-/// Removes the model of an earlier scene, and the folder if nothing else is in it.
+/// Removes the model of an earlier scene or of another program, binary and text, and the folder if nothing else is in it.
 ///
 /// # Errors
 /// When a file cannot be removed.
 pub fn remove_colmap(folder: &Path) -> Result<()> {
-    remove_files(folder, &FILES)
+    let parts = || PARTS.iter().chain(&FURTHER_PARTS);
+    let formats = [ColmapFormat::Binary, ColmapFormat::Text];
+    let files: Vec<String> =
+        formats.iter().flat_map(|format| parts().map(|part| format.file(part))).collect();
+    remove_files(folder, &files.iter().map(String::as_str).collect::<Vec<_>>())
 }
 
 #[cfg(test)]
@@ -175,6 +192,8 @@ mod tests {
     use setloc_sfm::{ImageId, Observation, Rigid};
 
     use super::*;
+    use crate::colmap::Bytes;
+    use crate::import::ImportedModel;
 
     fn scene(camera: Camera, tracks: &[&[(u32, u32)]]) -> Reconstruction {
         let image = |at: u32| ReconstructionImage {
@@ -201,30 +220,55 @@ mod tests {
         }
     }
 
-    /// The point of every keypoint by `images.txt`, and the keypoints of every point by `points3D.txt`.
+    /// The point of every keypoint by `images.bin`, and the keypoints of every point by `points3D.bin`.
     type Links = (BTreeMap<(usize, usize), usize>, BTreeMap<usize, Vec<(usize, usize)>>);
 
     fn written(model: &Reconstruction, features: &[Option<&ImageFeatures>]) -> Links {
         let folder = tempfile::tempdir().unwrap();
         write_colmap(folder.path(), model, features).unwrap();
-        let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
-        let numbers = |line: &str| -> Vec<f64> {
-            line.split_whitespace().map(|field| field.parse().unwrap_or(f64::NAN)).collect()
-        };
-        let (images, points, cameras) = (read("images.txt"), read("points3D.txt"), read("cameras.txt"));
-        assert_eq!(cameras.lines().count(), 2, "a camera without an image: {cameras}");
         let mut points_of_keypoints = BTreeMap::new();
-        for pair in images.lines().skip(2).collect::<Vec<_>>().chunks(2) {
-            let image = numbers(pair[0])[0] as usize;
-            for (index, keypoint) in numbers(pair[1]).chunks(3).enumerate().filter(|(_, k)| k[2] >= 0.0) {
-                points_of_keypoints.insert((image, index), keypoint[2] as usize);
-            }
+        for (image, keypoints) in images_of(folder.path()) {
+            let linked = keypoints.into_iter().enumerate().filter(|(_, (_, point))| *point != NO_POINT);
+            points_of_keypoints
+                .extend(linked.map(|(index, (_, point))| ((image as usize, index), point as usize)));
         }
-        let track = |line: &str| {
-            let fields = numbers(line);
-            (fields[0] as usize, fields[8..].chunks(2).map(|at| (at[0] as usize, at[1] as usize)).collect())
+        (points_of_keypoints, tracks_of(folder.path()))
+    }
+
+    fn read_part<T>(
+        folder: &Path,
+        part: &str,
+        mut record: impl FnMut(&mut Bytes<'_>) -> Result<T>,
+    ) -> Vec<T> {
+        let data = std::fs::read(folder.join(ColmapFormat::Binary.file(part))).unwrap();
+        let mut bytes = Bytes { left: &data };
+        let count = bytes.u64().unwrap();
+        let records = (0..count).map(|_| record(&mut bytes).unwrap()).collect();
+        assert!(bytes.left.is_empty(), "{part}: {} bytes too many", bytes.left.len());
+        records
+    }
+
+    /// The number of every image, and the place and point of each of its keypoints.
+    fn images_of(folder: &Path) -> Vec<(u32, Vec<([f64; 2], u64)>)> {
+        read_part(folder, "images", |bytes| {
+            let image = bytes.u32()?;
+            bytes.skip(7 * 8 + 4)?;
+            bytes.text()?;
+            let count = bytes.u64()?;
+            let keypoint = |_| Ok(([bytes.f64()?, bytes.f64()?], bytes.u64()?));
+            Ok((image, (0..count).map(keypoint).collect::<Result<_>>()?))
+        })
+    }
+
+    fn tracks_of(folder: &Path) -> BTreeMap<usize, Vec<(usize, usize)>> {
+        let point = |bytes: &mut Bytes<'_>| {
+            let point = bytes.u64()? as usize;
+            bytes.skip(3 * 8 + 3 + 8)?;
+            let count = bytes.u64()?;
+            let element = |_| Ok((bytes.u32()? as usize, bytes.u32()? as usize));
+            Ok((point, (0..count).map(element).collect::<Result<_>>()?))
         };
-        (points_of_keypoints, points.lines().skip(1).map(track).collect())
+        read_part(folder, "points3D", point).into_iter().collect()
     }
 
     #[test]
@@ -257,12 +301,9 @@ mod tests {
         model.cameras.push(other);
         model.images[1].camera = at;
         write_colmap(folder.path(), &model, &[Some(&features); 3]).unwrap();
-        let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
-        let cameras = read("cameras.txt");
-        assert_eq!(cameras.lines().skip(1).collect::<Vec<_>>(), ["1 EQUIRECTANGULAR 200 100 200 100"]);
-        let images = read("images.txt");
-        let numbers: Vec<f64> =
-            images.lines().nth(3).unwrap().split(' ').map(|number| number.parse().unwrap()).collect();
+        let read = ImportedModel::read_colmap(folder.path()).unwrap();
+        assert_eq!(read.cameras, BTreeMap::from([(1, Camera::equirectangular(200, 100))]));
+        let (numbers, _) = images_of(folder.path())[0].1[0];
         let shown = Camera::equirectangular(200, 100).unproject(&[numbers[0], numbers[1]].into()).unwrap();
         let expected = camera.unproject(&keypoint.pixel()).unwrap();
         assert!(shown.angle(&expected) < 1e-6, "{shown} {expected}");
@@ -297,8 +338,22 @@ mod tests {
         assert!(renew_colmap(&folder, &cropped, &[]).unwrap().is_some());
         assert!(!folder.exists());
         assert_eq!(renew_colmap(&folder, &whole, &[]).unwrap(), None);
-        std::fs::write(folder.join("rigs.txt"), "").unwrap();
+        std::fs::write(folder.join("project.ini"), "").unwrap();
         assert!(renew_colmap(&folder, &cropped, &[]).unwrap().is_some());
         assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn no_file_of_another_model_stays_beside_the_one_that_is_written() {
+        let folder = tempfile::tempdir().unwrap();
+        for older in ["images.txt", "cameras.txt", "rigs.bin", "frames.bin", "frames.txt", "mine.txt"] {
+            std::fs::write(folder.path().join(older), "older").unwrap();
+        }
+        write_colmap(folder.path(), &scene(Camera::equirectangular(100, 50), &[]), &[]).unwrap();
+        let entries = std::fs::read_dir(folder.path()).unwrap();
+        let mut names: Vec<_> =
+            entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        assert_eq!(names, ["cameras.bin", "images.bin", "mine.txt", "points3D.bin"]);
     }
 }

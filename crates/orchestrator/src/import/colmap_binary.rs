@@ -1,33 +1,26 @@
 //! COLMAP's binary model: little-endian numbers one after the other.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use setloc_features::{Camera, CameraModel};
 
 use super::Images;
+use super::cameras::{Cameras, ColmapModel};
 use super::poses::rigid;
-
-/// Bytes of a 2D point: its place and the number of its 3D point.
-const BYTES_OF_POINT: u64 = 24;
+use crate::colmap::{BYTES_OF_POINT_2D, Bytes};
 
 /// Reads `cameras.bin`.
-pub(super) fn cameras(file: &Path) -> Result<BTreeMap<u32, Camera>> {
+pub(super) fn cameras(file: &Path) -> Result<Cameras> {
     read(file, |bytes| {
-        let mut cameras = BTreeMap::new();
+        let mut cameras = Cameras::new();
         for _ in 0..bytes.u64()? {
             let (number, model) = (bytes.u32()?, bytes.i32()?);
-            let known = CameraModel::ALL.into_iter().find(|known| known.colmap_id() == Some(model));
-            let model = known.with_context(|| {
-                format!("camera {number} has COLMAP's camera model {model}, which is not known here")
-            })?;
+            let place = || format!("camera {number}");
+            let model = ColmapModel::of_id(model).with_context(place)?;
             let size = |pixels: u64| u32::try_from(pixels).context("more than 2³² pixels a side");
-            let (width, height) = (size(bytes.u64()?)?, size(bytes.u64()?)?);
+            let size = (size(bytes.u64()?)?, size(bytes.u64()?)?);
             let params = (0..model.num_params()).map(|_| bytes.f64()).collect::<Result<_>>()?;
-            let camera = Camera { model, width, height, params };
-            camera.validate().with_context(|| format!("camera {number}"))?;
-            cameras.insert(number, camera);
+            cameras.insert(number, model.camera(size, params).with_context(place)?);
         }
         Ok(cameras)
     })
@@ -45,7 +38,7 @@ pub(super) fn images(file: &Path, check: impl Fn(u32) -> Result<()>) -> Result<I
             }
             let (camera, name) = (bytes.u32()?, bytes.text()?);
             let points = bytes.u64()?;
-            bytes.skip(points.saturating_mul(BYTES_OF_POINT))?;
+            bytes.skip(points.saturating_mul(BYTES_OF_POINT_2D as u64))?;
             let place = || format!("image {number}, {name}");
             let camera_from_world = rigid(pose).with_context(place)?;
             check(camera).with_context(place)?;
@@ -62,53 +55,12 @@ fn read<T>(file: &Path, parse: impl FnOnce(&mut Bytes<'_>) -> Result<T>) -> Resu
     parsed.with_context(|| format!("{}, byte {}", file.display(), data.len() - bytes.left.len()))
 }
 
-/// What is left of a file.
-struct Bytes<'f> {
-    left: &'f [u8],
-}
-
-impl Bytes<'_> {
-    fn take<const N: usize>(&mut self) -> Result<[u8; N]> {
-        let (taken, left) = self.left.split_first_chunk().context("the file ends here: it is cut off")?;
-        self.left = left;
-        Ok(*taken)
-    }
-
-    fn skip(&mut self, count: u64) -> Result<()> {
-        let left = usize::try_from(count).ok().and_then(|count| self.left.get(count..));
-        self.left = left.with_context(|| format!("{count} bytes ought to follow: the file is cut off"))?;
-        Ok(())
-    }
-
-    /// Up to the next zero.
-    fn text(&mut self) -> Result<String> {
-        let end = self.left.iter().position(|byte| *byte == 0).context("a name without an end")?;
-        let text = String::from_utf8(self.left[..end].to_vec()).context("a name is not UTF-8")?;
-        self.left = &self.left[end + 1..];
-        Ok(text)
-    }
-
-    fn u64(&mut self) -> Result<u64> {
-        self.take().map(u64::from_le_bytes)
-    }
-
-    fn u32(&mut self) -> Result<u32> {
-        self.take().map(u32::from_le_bytes)
-    }
-
-    fn i32(&mut self) -> Result<i32> {
-        self.take().map(i32::from_le_bytes)
-    }
-
-    fn f64(&mut self) -> Result<f64> {
-        self.take().map(f64::from_le_bytes)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
+    use setloc_features::CameraModel;
 
+    use super::super::cameras::ColmapCamera;
     use super::*;
 
     fn written(name: &str, bytes: &[u8]) -> (tempfile::TempDir, std::path::PathBuf) {
@@ -139,7 +91,8 @@ mod tests {
     #[test]
     fn cameras_and_poses_are_read() {
         let (_folder, file) = written("cameras.bin", &camera_bytes(0, &[500.0, 320.0, 240.0]));
-        let camera = &cameras(&file).unwrap()[&7];
+        let cameras = cameras(&file).unwrap();
+        let ColmapCamera::Known(camera) = &cameras[&7] else { panic!("{cameras:?}") };
         assert_eq!((camera.model, camera.width, camera.height), (CameraModel::SimplePinhole, 640, 480));
         assert_eq!(camera.params, [500.0, 320.0, 240.0]);
         let (_folder, file) = written("images.bin", &image_bytes([1.0, 0.0, 0.0, 0.0]));
@@ -159,8 +112,11 @@ mod tests {
         for length in 0..whole.len() {
             assert!(error_of_cameras(&whole[..length]).contains("cut off"), "{length}");
         }
-        let unknown = error_of_cameras(&camera_bytes(10, &[1.0; 12]));
-        assert!(unknown.contains("cameras.bin, byte 16") && unknown.contains("camera model 10"), "{unknown}");
+        let unknown = error_of_cameras(&camera_bytes(99, &[1.0; 12]));
+        assert!(
+            unknown.contains("cameras.bin, byte 16: camera 7: camera model 99 is none of COLMAP"),
+            "{unknown}"
+        );
         assert!(error_of_cameras(&camera_bytes(0, &[f64::NAN, 1.0, 1.0])).contains("camera 7"));
 
         let error_of_images = |bytes: &[u8]| {

@@ -1,19 +1,17 @@
 //! COLMAP's text model.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use serde_json::json;
-use setloc_features::Camera;
 use setloc_sfm::Rigid;
 
 use super::Images;
+use super::cameras::{Cameras, ColmapCamera, ColmapModel};
 use super::poses::{finite, world_from_camera};
 
 /// Reads `cameras.txt`.
-pub(super) fn cameras(file: &Path) -> Result<BTreeMap<u32, Camera>> {
-    let mut cameras = BTreeMap::new();
+pub(super) fn cameras(file: &Path) -> Result<Cameras> {
+    let mut cameras = Cameras::new();
     for (at, line) in read(file)?.lines().enumerate() {
         if is_content(line) {
             let place = || format!("{}, line {}", file.display(), at + 1);
@@ -52,18 +50,14 @@ pub(super) fn is_content(line: &str) -> bool {
 }
 
 /// `CAMERA_ID MODEL WIDTH HEIGHT PARAMS…`
-fn parse_camera(line: &str) -> Result<(u32, Camera)> {
+fn parse_camera(line: &str) -> Result<(u32, ColmapCamera)> {
     let fields: Vec<&str> = line.split_whitespace().collect();
     let [number, model, width, height, params @ ..] = &fields[..] else {
         anyhow::bail!("a camera has number, model, width, height and parameters");
     };
     let params = params.iter().map(|text| finite(text)).collect::<Result<Vec<f64>>>()?;
-    let (width, height): (u32, u32) = (width.parse()?, height.parse()?);
-    let camera: Camera = serde_json::from_value(
-        json!({ "model": model, "width": width, "height": height, "params": params }),
-    )?;
-    camera.validate()?;
-    Ok((number.parse()?, camera))
+    let size = (width.parse()?, height.parse()?);
+    Ok((number.parse()?, ColmapModel::of_name(model)?.camera(size, params)?))
 }
 
 /// `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, the pose camera-from-world.

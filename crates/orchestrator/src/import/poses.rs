@@ -10,8 +10,8 @@ use setloc_camset::Verdict;
 use setloc_features::GeoPosition;
 use setloc_sfm::Rigid;
 
-use super::ColmapFormat;
 use super::colmap_text::is_content;
+use crate::colmap::ColmapFormat;
 use crate::dataset::rigid_of;
 use crate::error::Hinted;
 
@@ -39,7 +39,7 @@ impl NamedPoses {
 
 /// Reads `world_from_camera` of images by name.
 ///
-/// Of a folder: its `truth.json`, or the COLMAP model in it. Of a JSON file: a `truth.json`; the `poses.json` of `build` (what is in
+/// Of a folder: its `truth.json`, else its `poses.json`, else the COLMAP model in it. Of a JSON file: a `truth.json`; the `poses.json` of `build` (what is in
 /// the frame of the largest component), of `locate` (the scene's images, and what is *localized* in that frame) or of `bench`. Of any other file: lines of
 /// a name and the camera-from-world pose, as `images.txt` begins, and as hloc and the benchmarks of visuallocalization.net have them.
 ///
@@ -48,9 +48,9 @@ impl NamedPoses {
 pub fn read_poses(path: &Path) -> Result<NamedPoses> {
     let mut origin = None;
     let poses = if path.is_dir() {
-        let truth = path.join("truth.json");
-        if truth.is_file() {
-            return read_poses(&truth);
+        let listed = ["truth.json", "poses.json"].map(|name| path.join(name));
+        if let Some(file) = listed.iter().find(|file| file.is_file()) {
+            return read_poses(file);
         }
         let images = ColmapFormat::of(path)?.images(path, |_| Ok(()))?;
         images.into_iter().map(|(name, (_, pose))| (name, pose)).collect()
@@ -170,7 +170,7 @@ fn of_json(json: &Value) -> Result<BTreeMap<String, Rigid>> {
 }
 
 /// `{"q_wxyz", "center"}`, both of the camera in the world, or `{"R", "C"}`, of which R turns from the world into the camera.
-fn of_value(value: &Value) -> Result<Rigid> {
+pub(super) fn of_value(value: &Value) -> Result<Rigid> {
     let center = numbers::<3>(value.get("center").unwrap_or(&value["C"]));
     let [x, y, z] = center.context("`center` is not 3 numbers")?;
     if let Some(rows) = value["R"].as_array() {
@@ -261,6 +261,20 @@ mod tests {
         assert!(without.in_frame_of(&truth).is_none() && truth.in_frame_of(&without).is_none());
         let error = read("a.json", r#"{"geo_origin": {"lat": 91, "lon": 8}, "images": {}}"#).unwrap_err();
         assert!(format!("{error:#}").contains("a.json: `geo_origin` is no place"), "{error:#}");
+    }
+
+    #[test]
+    fn of_a_folder_the_truth_counts_before_results_and_these_before_a_model() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+        let first = || read_poses(folder.path()).unwrap().poses.into_keys().next().unwrap();
+        write("images.txt", "1 1 0 0 0 0 0 0 1 of a model.jpg\n\n");
+        assert_eq!(first(), "of a model.jpg");
+        let pose = r#"{"q_wxyz": [1, 0, 0, 0], "center": [1, 2, 3]}"#;
+        write("poses.json", &format!(r#"{{"of results.jpg": {pose}}}"#));
+        assert_eq!(first(), "of results.jpg");
+        write("truth.json", &format!(r#"{{"images": {{"true.jpg": {pose}}}}}"#));
+        assert_eq!(first(), "true.jpg");
     }
 
     #[test]

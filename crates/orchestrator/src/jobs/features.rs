@@ -52,7 +52,8 @@ pub fn add_features_of(
     images.iter().map(|image| add_features(graph, image, params, None)).collect()
 }
 
-pub(super) fn features_role(at: usize) -> String {
+/// What the features of the image at this place of the list are to a job.
+pub fn features_role(at: usize) -> String {
     format!("features {at:04}")
 }
 

@@ -20,6 +20,11 @@ use crate::locating::best_answers;
 use crate::scene::{Block, SceneFile};
 use crate::stages;
 
+/// Kind of the job that makes the file of a scene that has grown.
+pub const GROWN_KIND: &str = "grown";
+/// What the file of the scene before is to that job.
+pub const SCENE_INPUT: &str = "scene";
+
 /// The jobs that located photos.
 #[derive(Debug, Clone)]
 pub struct LocatedJobs {
@@ -69,11 +74,11 @@ pub fn add_grown(
     let whole = ContentHash::of(&codec::encode(&*what.scene)?);
     let (owned, scene) = (photos.to_vec(), Arc::clone(&what.scene));
     let grown = graph.add(Job {
-        kind: "grown",
+        kind: GROWN_KIND,
         version: stages::GROWN_VERSION,
         name: name.to_owned(),
         params,
-        external: BTreeMap::from([("scene".to_owned(), whole)]),
+        external: BTreeMap::from([(SCENE_INPUT.to_owned(), whole)]),
         memory: 128 << 20,
         work: Box::new(move |inputs| Product::new(grown_scene(inputs, &owned, &names, &scene, &index)?)),
     });

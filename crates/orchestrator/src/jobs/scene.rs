@@ -233,10 +233,13 @@ fn add_index(graph: &mut JobGraph<'_>, config: &Config, jobs: &ModelJobs) -> Res
 }
 
 /// Adds the job that makes the scene file of a model and its index.
+/// Kind of the job that makes a scene's file.
+pub const SCENE_KIND: &str = "scene";
+
 fn add_scene_file(graph: &mut JobGraph<'_>, recipe: SceneRecipe, jobs: &ModelJobs, index: JobId) -> JobId {
     let params = recipe.params();
     let scene = graph.add(Job {
-        kind: "scene",
+        kind: SCENE_KIND,
         version: stages::SCENE_VERSION,
         name: "scene".to_owned(),
         params,

@@ -188,6 +188,27 @@ impl Records {
         Ok(self.files()?.into_iter().filter_map(read).collect())
     }
 
+    /// All undamaged records of jobs of these kinds.
+    ///
+    /// # Errors
+    /// When the folder cannot be listed.
+    pub fn of_kinds(&self, kinds: &[&str]) -> Result<Vec<KeyRecord>> {
+        let starts: Vec<String> =
+            kinds.iter().map(|kind| format!(r#"","fingerprint":{{"kind":"{kind}","#)).collect();
+        // Most records are of other kinds, and not parsed.
+        let is_wanted = |line: &&[u8]| {
+            let after_key = line.get(LINE_START.len() + KEY_LEN..).unwrap_or_default();
+            starts.iter().any(|start| after_key.starts_with(start.as_bytes()))
+        };
+        let mut records = Vec::new();
+        for file in self.files()? {
+            let Ok(text) = fs::read(file) else { continue };
+            let wanted = text.split(|&byte| byte == b'\n').filter(is_wanted);
+            records.extend(wanted.filter_map(|line| record_of(line).ok()));
+        }
+        Ok(records)
+    }
+
     /// Removes damaged records; returns the keys they seem to have, or the file and line where nothing is legible.
     ///
     /// # Errors
@@ -273,10 +294,15 @@ fn key_of(line: &[u8]) -> Option<ContentHash> {
 /// The records of a file; a damaged one as its line.
 fn lines(text: &[u8]) -> impl Iterator<Item = Result<KeyRecord, &[u8]>> {
     let lines = text.split(|&byte| byte == b'\n').filter(|line| !line.is_empty());
-    lines.map(|line| match serde_json::from_slice::<KeyRecord>(line) {
+    lines.map(record_of)
+}
+
+/// The record of a line; a damaged one as the line.
+fn record_of(line: &[u8]) -> Result<KeyRecord, &[u8]> {
+    match serde_json::from_slice::<KeyRecord>(line) {
         Ok(record) if record.is_whole() => Ok(record),
         _ => Err(line),
-    })
+    }
 }
 
 #[cfg(test)]
@@ -303,6 +329,17 @@ mod tests {
         // The list is young: the miss is not looked up again at once, but later.
         std::thread::sleep(LIST_AGE);
         assert_eq!(there.find(small.key), Some(small));
+    }
+
+    #[test]
+    fn records_are_found_by_their_kind() {
+        let folder = tempfile::tempdir().unwrap();
+        let records = Records::at(folder.path().join("keys"));
+        assert!(records.of_kinds(&["test"]).unwrap().is_empty());
+        let (first, second) = (record(1, b"small"), record(2, &[7; MAX_CONTENT + 1]));
+        records.add(&[first.clone(), second.clone()]).unwrap();
+        assert_eq!(records.of_kinds(&["other", "test"]).unwrap(), [first, second]);
+        assert!(records.of_kinds(&["other", "tes"]).unwrap().is_empty());
     }
 
     #[test]

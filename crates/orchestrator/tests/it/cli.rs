@@ -1,6 +1,6 @@
 //! What the program says: help, errors with their hints, reports. `INSTA_UPDATE=always` accepts new texts.
 
-use crate::common::{gave, panoramas, program, said, setloc, town};
+use crate::common::{first_track_of_colmap, gave, images_of_colmap, panoramas, program, said, setloc, town};
 
 #[test]
 fn help_says_what_there_is() {
@@ -222,8 +222,17 @@ fn a_scene_grows_by_localized_photos_and_says_so() {
     }
     let poses = std::fs::read_to_string(folder.path().join("g/poses.json")).unwrap();
     assert!(poses.contains("\"grown\": true") && poses.contains("\"grown\": false"), "{poses}");
-    let colmap = std::fs::read_to_string(folder.path().join("g/colmap/images.txt")).unwrap();
-    assert!(colmap.contains("grown-1/lane/img_00.jpg"), "{colmap}");
+    assert!(images_of_colmap(&folder.path().join("g/colmap")).contains("grown-1/lane/img_00.jpg"));
+    assert!(images_of_colmap(&folder.path().join("out/colmap")).contains("lane/img_00.jpg"));
+    for model in ["s/colmap", "g/colmap", "out/colmap"] {
+        assert!(first_track_of_colmap(&folder.path().join(model)) >= 2, "{model}");
+    }
+    let lacks = "lacks 2D points and tracks of";
+    assert!(!said(&grown).contains(lacks), "{}", said(&grown));
+    let apart = run(&["export", "g.setloc", "--format", "colmap", "-o", "m", "--cache", "elsewhere"]);
+    assert!(said(&apart).contains(lacks) && first_track_of_colmap(&folder.path().join("m")) == 0);
+    let whole = run(&["export", "g.setloc", "--format", "colmap", "-o", "m"]);
+    assert!(!said(&whole).contains(lacks) && first_track_of_colmap(&folder.path().join("m")) >= 2);
 
     // The same again is the same, and what it has grown by it does not grow by again.
     assert_eq!(grow("s.setloc", "h.setloc").status.code(), Some(0));

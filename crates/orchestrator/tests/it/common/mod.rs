@@ -77,6 +77,18 @@ pub fn logged(log: &Path, event: &str) -> Vec<String> {
         .collect()
 }
 
+/// What the images of a COLMAP model are called, among other bytes.
+pub fn images_of_colmap(folder: &Path) -> String {
+    String::from_utf8_lossy(&std::fs::read(folder.join("images.bin")).unwrap()).into_owned()
+}
+
+/// How many images see the first point of a COLMAP model.
+pub fn first_track_of_colmap(folder: &Path) -> u64 {
+    let points = std::fs::read(folder.join("points3D.bin")).unwrap();
+    // After the count of points: its number, place, colour and error.
+    u64::from_le_bytes(points[8 + 8 + 24 + 3 + 8..][..8].try_into().unwrap())
+}
+
 /// All files in a folder and below, sorted.
 pub fn files_below(folder: &Path) -> Vec<PathBuf> {
     let mut files = Vec::new();
