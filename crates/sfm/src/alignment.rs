@@ -39,7 +39,7 @@ use crate::{
 pub(crate) const STITCHING_OF_EACH: f64 = 0.0005;
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 25;
+pub const ALIGNMENT_VERSION: u32 = 26;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;
@@ -128,7 +128,8 @@ pub struct KnownOfComponent<'a> {
 /// for each, from several threads.
 ///
 /// In a component in which photos share a standpoint nothing moves, as what ties their centres together is not known
-/// here: its points get their places only.
+/// here: its points get their places only. Those that see too little to be adjusted do not count: they go with the image
+/// that they were turned from.
 ///
 /// # Errors
 /// The first of `load`, in the order of images; the component may then be adjusted by its own views only.
@@ -156,13 +157,16 @@ pub fn align_tracks<E: Send>(
         .filter(|(template, _)| template.is_some())
         .map(|(_, point)| point.track.len() - 1)
         .sum();
-    if shares_standpoints(component, &registered) {
-        let placed = tracks.placed(&aligned, &tracks.middles(&aligned), &[]);
+    let middles = tracks.middles(&aligned);
+    let mut problem = tracks.problem(known.cameras, &aligned, &middles, &[]);
+    if shares_standpoints(&problem) {
+        let placed = tracks.placed(&aligned, &middles, &[]);
         for (point, placed) in component.points.iter_mut().zip(placed) {
             point.aligned = placed.map(|(aligned, _)| aligned);
         }
         return Ok(report);
     }
+    let turned = turned_on_the_spot(&problem);
     let bundle = BundleParams {
         loss: RobustLoss::Cauchy(params.loss_sigma),
         max_iterations: params.max_iterations,
@@ -170,7 +174,6 @@ pub fn align_tracks<E: Send>(
         ..BundleParams::default()
     };
     let first = BundleParams { function_tolerance: FIRST_TOLERANCE, ..bundle };
-    let mut problem = tracks.problem(known.cameras, &aligned, &tracks.middles(&aligned), &[]);
     solve(&first, &mut problem, tracks.component, known.positions);
     let (references, planes) = (tracks.references, tracks.planes);
     store(component, features, &problem);
@@ -179,10 +182,11 @@ pub fn align_tracks<E: Send>(
     // Now it is known where the patches lie in views that no keypoint ties to them.
     let tracks = Tracks { planes, references, ..Tracks::new(params, component, features) };
     let middles = tracks.middles(&aligned);
-    let further = in_each(&registered, &load, |image, pyramid| {
-        tracks.seek_further(image, pyramid, &templates, &middles)
-    })?
-    .concat();
+    let steady = registered.iter().zip(&turned).filter(|(_, turned)| !**turned);
+    let steady: Vec<ImageId> = steady.map(|(image, _)| *image).collect();
+    let further =
+        in_each(&steady, &load, |image, pyramid| tracks.seek_further(image, pyramid, &templates, &middles))?
+            .concat();
     report.further = further.len();
     let mut problem = tracks.problem(known.cameras, &aligned, &middles, &further);
     for prior in problem.camera_priors.iter_mut().filter(|prior| prior.camera as usize >= shared) {
@@ -282,14 +286,20 @@ fn solve(
     component: &Reconstruction,
     positions: Option<&MeasuredPositions>,
 ) {
-    let Some(positions) = positions else {
-        bundle::solve(params, problem);
-        return;
-    };
-    hold_by_positions(problem, component, positions, params.loss);
+    leave_out_turned(problem);
+    if let Some(positions) = positions {
+        hold_by_positions(problem, component, positions, params.loss);
+    }
     let before = problem.poses.clone();
     bundle::solve(params, problem);
     follow(problem, &before);
+}
+
+/// How many observations each pose of a problem has.
+fn seen_by_poses(problem: &BundleProblem) -> Vec<usize> {
+    let mut seen = vec![0; problem.poses.len()];
+    problem.observations.iter().for_each(|observation| seen[observation.pose as usize] += 1);
+    seen
 }
 
 /// Frees the frame of a component's adjustment and holds it by measured positions.
@@ -301,8 +311,7 @@ pub(crate) fn hold_by_positions(
     positions: &MeasuredPositions,
     loss: RobustLoss,
 ) {
-    let mut seen = vec![0; problem.poses.len()];
-    problem.observations.iter().for_each(|observation| seen[observation.pose as usize] += 1);
+    let seen = seen_by_poses(problem);
     for (pose, seen) in problem.poses.iter_mut().zip(seen) {
         pose.fixed = seen < MIN_ADJUSTABLE_POINTS;
     }
@@ -317,12 +326,13 @@ pub(crate) fn hold_by_positions(
 }
 
 /// Moves the poses of a problem that were left out of its adjustment as the nearest of the others has moved since `before`.
-fn follow(problem: &mut BundleProblem, before: &[BundlePose]) {
-    let moved: Vec<(Rigid, Rigid)> = (before.iter().zip(&problem.poses))
-        .filter(|(before, _)| !before.fixed)
-        .map(|(before, after)| (before.world_from_camera, after.world_from_camera))
+pub(crate) fn follow(problem: &mut BundleProblem, before: &[BundlePose]) {
+    let seen = seen_by_poses(problem);
+    let moved: Vec<(Rigid, Rigid)> = (before.iter().zip(&problem.poses).zip(&seen))
+        .filter(|(_, seen)| **seen > 0)
+        .map(|((before, after), _)| (before.world_from_camera, after.world_from_camera))
         .collect();
-    for pose in problem.poses.iter_mut().filter(|pose| pose.fixed) {
+    for (pose, _) in problem.poses.iter_mut().zip(seen).filter(|(_, seen)| *seen == 0) {
         let here = pose.world_from_camera.translation;
         let distance = |of: &Rigid| (of.translation - here).norm_squared();
         let nearest = moved.iter().min_by(|a, b| distance(&a.0).total_cmp(&distance(&b.0)));
@@ -332,16 +342,49 @@ fn follow(problem: &mut BundleProblem, before: &[BundlePose]) {
     }
 }
 
-/// Whether two images have one centre, as photos turned on the spot do.
-pub(crate) fn shares_standpoints(component: &Reconstruction, registered: &[ImageId]) -> bool {
-    let mut centers: Vec<[f64; 3]> = registered
-        .iter()
-        .filter_map(|image| Some(component.images[image.index()].world_from_camera?.translation.into()))
-        .collect();
-    centers.sort_by(|a, b| {
-        a.iter().zip(b).map(|(a, b)| a.total_cmp(b)).find(|order| order.is_ne()).unwrap_or(Ordering::Equal)
-    });
-    centers.windows(2).any(|pair| pair[0] == pair[1])
+/// The poses of a problem by where they stand, those of one place together, and what each has observations: most first.
+///
+/// Images of one place are photos turned on the spot. They have one centre to the last digit.
+fn standpoints(problem: &BundleProblem) -> Vec<Vec<(usize, usize)>> {
+    let center = |pose: usize| -> [f64; 3] { problem.poses[pose].world_from_camera.translation.into() };
+    let by_place = |a: usize, b: usize| {
+        let apart = center(a).into_iter().zip(center(b)).map(|(a, b)| a.total_cmp(&b));
+        apart.fold(Ordering::Equal, Ordering::then)
+    };
+    let mut all: Vec<(usize, usize)> = seen_by_poses(problem).into_iter().enumerate().collect();
+    all.sort_by(|a, b| by_place(a.0, b.0).then(b.1.cmp(&a.1)));
+    all.chunk_by(|a, b| center(a.0) == center(b.0)).map(<[_]>::to_vec).collect()
+}
+
+/// Whether two images of a problem that see enough to be adjusted have one centre, as photos turned on the spot do.
+pub(crate) fn shares_standpoints(problem: &BundleProblem) -> bool {
+    let second = |of_place: Vec<(usize, usize)>| of_place.get(1).map_or(0, |(_, seen)| *seen);
+    standpoints(problem).into_iter().map(second).any(|seen| seen >= MIN_ADJUSTABLE_POINTS)
+}
+
+/// Which poses of a problem see too little to be adjusted and stand just where another one does: the mapper puts images that were
+/// turned on the spot there.
+fn turned_on_the_spot(problem: &BundleProblem) -> Vec<bool> {
+    let mut turned = vec![false; problem.poses.len()];
+    for of_place in standpoints(problem) {
+        let others = of_place.into_iter().skip(1);
+        others.for_each(|(pose, seen)| turned[pose] = seen < MIN_ADJUSTABLE_POINTS);
+    }
+    turned
+}
+
+/// Leaves those poses out of an adjustment, so that they [`follow`]: what little they see would hold the images that they were turned
+/// from.
+pub(crate) fn leave_out_turned(problem: &mut BundleProblem) {
+    let turned = turned_on_the_spot(problem);
+    problem.observations.retain(|seen| !turned[seen.pose as usize]);
+    for (pose, _) in problem.poses.iter_mut().zip(&turned).filter(|(_, turned)| **turned) {
+        pose.fixed = true;
+    }
+    // One that stays has to hold the frame.
+    if let Some(first) = turned.iter().position(|turned| !turned) {
+        problem.poses[first].fixed = true;
+    }
 }
 
 /// Templates by point, and where the views show them by point and place in the track.

@@ -31,7 +31,9 @@ pub use self::matched::shared_sigma_of_matches;
 pub use self::shared::BearingField;
 use self::shared::shared_sigma_rad;
 use self::stitching::{OwnCameras, SharedStitching, draw_priors, move_places};
-use crate::alignment::{STITCHING_OF_EACH, adjustable_poses, hold_by_positions, shares_standpoints};
+use crate::alignment::{
+    STITCHING_OF_EACH, adjustable_poses, follow, hold_by_positions, leave_out_turned, shares_standpoints,
+};
 use crate::bundle::{
     self, BundleObservation, BundlePoint, BundleProblem, CameraPrior, IntrinsicsFreedom, RobustLoss,
 };
@@ -70,7 +72,7 @@ pub struct PoseDeviation {
 
 impl ModelErrors {
     /// The errors of a model that has aligned places ([`crate::AlignedTrack`]); `None` where it has none, or images of one
-    /// standpoint, of which what ties them together is not known.
+    /// standpoint that see enough to be adjusted, of which what ties them together is not known.
     ///
     /// Intrinsics stay as they are, but for how panoramas are stretched: that was told by the same bearings. What whole
     /// hemispheres share besides is not in it, as the poses take it up; nor is a fold.
@@ -83,10 +85,11 @@ impl ModelErrors {
         by_matches: f64,
     ) -> Option<Self> {
         let images: Vec<ImageId> = model.registered().collect();
-        if shares_standpoints(model, &images) {
+        let (mut places, pose_of_image) = problem_of(model);
+        if shares_standpoints(&places) {
             return None;
         }
-        let (mut places, pose_of_image) = problem_of(model);
+        leave_out_turned(&mut places);
         if let Some(positions) = positions {
             hold_by_positions(&mut places, model, positions, LOSS);
         }
@@ -97,6 +100,7 @@ impl ModelErrors {
         if problem.observations.is_empty() || !bundle::step(&mut unmoved) {
             return None;
         }
+        follow(&mut unmoved, &problem.poses);
         let shared_sigma_rad = shared_sigma_rad(model).max(by_matches);
         let own = OwnCameras::of(model);
         let shared_stitching = SharedStitching::of(&problem, &own);
@@ -129,7 +133,9 @@ impl ModelErrors {
             let moved = problem.without_frame(&moved);
             drawn.position_priors.iter_mut().zip(moved).for_each(|(prior, moved)| prior.position += moved);
             // What has no answer to one draw has none to the unmoved places either.
-            if !bundle::step(&mut drawn) {
+            if bundle::step(&mut drawn) {
+                follow(&mut drawn, &problem.poses);
+            } else {
                 drawn.clone_from(&unmoved);
             }
             let pairs = unmoved.poses.iter().zip(&drawn.poses);
@@ -302,7 +308,8 @@ fn common_frame(pairs: &[(Rigid, Rigid)]) -> Similarity {
 /// A pose moved as another one is from before to after.
 pub(crate) fn moved_alike(pose: &Rigid, before: &Rigid, after: &Rigid) -> Rigid {
     let turn = after.rotation * before.rotation.inverse();
-    Rigid::new(turn * pose.rotation, pose.translation + after.translation - before.translation)
+    // In this order what stood at one place still does, to the last digit.
+    Rigid::new(turn * pose.rotation, pose.translation - before.translation + after.translation)
 }
 
 /// A camera with its parameters changed as those of another one are from before to after.
@@ -330,10 +337,15 @@ mod tests {
 
     fn street_of(camera: &Camera, noise_px: f64, shared_rad: f64, seed: u64) -> (Reconstruction, Vec<Rigid>) {
         let (mut model, truth) = seen_street(6, camera, noise_px, shared_rad, seed);
-        let (mut problem, _) = problem_of(&model);
-        bundle::solve(&bundle::BundleParams::default(), &mut problem);
-        take(&mut model, &problem);
+        adjust(&mut model);
         (model, truth)
+    }
+
+    /// Adjusts a model to its places.
+    pub(super) fn adjust(model: &mut Reconstruction) {
+        let (mut problem, _) = problem_of(model);
+        bundle::solve(&bundle::BundleParams::default(), &mut problem);
+        take(model, &problem);
     }
 
     fn take(model: &mut Reconstruction, problem: &BundleProblem) {
@@ -406,6 +418,40 @@ mod tests {
             }
         }
         (model, truth)
+    }
+
+    /// A seventh panorama that few points see, or none, where the third stands.
+    #[test]
+    fn an_image_turned_on_the_spot_is_off_as_the_one_that_it_was_turned_from() {
+        let (mut model, _) = street(0.15, 0.0, 3);
+        let mut turned = model.images[2].clone();
+        turned.name = "turned".to_owned();
+        model.images.push(turned);
+        let deviations = |model: &Reconstruction| {
+            let errors = ModelErrors::of_model(model, None, 0.0).expect("it has places");
+            [2, 6].map(|image| errors.deviation(model, ImageId(image)).expect("is registered"))
+        };
+        let [anchor, turned] = deviations(&model);
+        assert!((turned.center - anchor.center).abs() <= 1e-9 * anchor.center, "{turned:?} {anchor:?}");
+        assert!((turned.rotation_rad - anchor.rotation_rad).abs() <= 1e-6 * anchor.rotation_rad);
+        let see = |model: &mut Reconstruction, count: usize| {
+            let seen_by_third = |point: &&mut ReconstructionPoint| {
+                let images = || point.track.iter().map(|seen| seen.image);
+                images().any(|image| image == ImageId(2)) && images().all(|image| image != ImageId(6))
+            };
+            for point in model.points.iter_mut().filter(seen_by_third).take(count) {
+                let at = point.track.iter().position(|seen| seen.image == ImageId(2)).unwrap();
+                point.track.push(Observation { image: ImageId(6), ..point.track[at] });
+                let places = &mut point.aligned.as_mut().unwrap().places;
+                places.push(places[at]);
+            }
+        };
+        see(&mut model, 8);
+        let [with_few, turned] = deviations(&model);
+        assert!((turned.center - with_few.center).abs() <= 1e-9 * with_few.center, "{turned:?} {with_few:?}");
+        assert!((with_few.center / anchor.center - 1.0).abs() < 1e-9, "{with_few:?} {anchor:?}");
+        see(&mut model, 20);
+        assert_eq!(ModelErrors::of_model(&model, None, 0.0), None);
     }
 
     #[test]
@@ -562,11 +608,6 @@ mod tests {
                     place.pixel = own[seen.image.index()].project(&bearing).unwrap();
                 }
             }
-            let adjust = |model: &mut Reconstruction| {
-                let (mut problem, _) = problem_of(model);
-                bundle::solve(&bundle::BundleParams::default(), &mut problem);
-                take(model, &problem);
-            };
             adjust(&mut model);
             for at in 0..6 {
                 model.images[at].camera = CameraId(model.cameras.len() as u32);

@@ -231,6 +231,39 @@ fn photos_of_one_standpoint_stay_and_their_points_get_places() {
 }
 
 #[test]
+fn an_image_turned_on_the_spot_that_sees_little_keeps_no_other_from_being_aligned() {
+    let mut room =
+        Room::new("an_image_turned_on_the_spot_that_sees_little_keeps_no_other_from_being_aligned");
+    let (alone, _) = room.align(&AlignmentParams::default());
+    // The second panorama again, in which nine points are known.
+    let (again, turned) = (ImageId(1), ImageId(4));
+    let mut image = room.model.images[again.index()].clone();
+    image.name = "turned".to_owned();
+    room.model.images.push(image);
+    room.features.push(room.features[again.index()].clone());
+    room.pyramids.push(Arc::clone(&room.pyramids[again.index()]));
+    let seen_there =
+        |point: &ReconstructionPoint| point.track.iter().find(|seen| seen.image == again).copied();
+    let shared: Vec<(usize, Observation)> = (room.model.points.iter().enumerate())
+        .filter_map(|(at, point)| Some((at, seen_there(point)?)))
+        .collect();
+    for &(at, seen) in shared.iter().take(9) {
+        room.model.points[at].track.push(Observation { image: turned, ..seen });
+    }
+    let (model, report) = room.align(&AlignmentParams::default());
+    assert!(report.further > 0, "{report:?}");
+    let pose =
+        |model: &Reconstruction, image: ImageId| model.images[image.index()].world_from_camera.unwrap();
+    assert_eq!(pose(&model, turned).translation, pose(&model, again).translation);
+    assert!(pose(&model, turned).rotation.angle_to(&pose(&model, again).rotation) < 1e-9);
+    let centers = |of: &Reconstruction| [0, 1, 2, 3].map(|image| pose(of, ImageId(image)).translation);
+    let apart = centers(&model).into_iter().zip(centers(&alone)).map(|(a, b)| (a - b).norm());
+    let apart = apart.fold(0.0, f64::max);
+    let moved = (pose(&model, ImageId(1)).translation - pose(&room.model, ImageId(1)).translation).norm();
+    assert!(apart < 0.2 * moved, "{apart} {moved}");
+}
+
+#[test]
 fn panoramas_that_are_each_stitched_a_little_otherwise_get_cameras_of_their_own() {
     let mut rng = seeded("panoramas_that_are_each_stitched_a_little_otherwise_get_cameras_of_their_own");
     let mut shared = Camera::equirectangular(640, 320).as_stitched().unwrap();
