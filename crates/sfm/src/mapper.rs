@@ -360,9 +360,9 @@ impl<'a> Mapper<'a> {
         }
         found.sort_by_key(|(_, pose)| Reverse(pose.inliers.len()));
         let mut found = found.into_iter();
-        let mut records = Vec::new();
+        let (judge, mut records) = (self.judge(), Vec::new());
         let accepted = found.by_ref().find_map(|(edge, pose)| {
-            Some((edge.image, self.first_accepted(edge.image, vec![pose], &mut false, &mut records)?))
+            Some((edge.image, judge.first_accepted(edge.image, vec![pose], &mut false, &mut records)?))
         });
         self.records.append(&mut records);
         // Those that were not looked at come again.
@@ -393,7 +393,7 @@ impl<'a> Mapper<'a> {
         }
         found.sort_by_key(|(_, continued)| Reverse(continued.length.votes));
         let mut found = found.into_iter();
-        let mut records = Vec::new();
+        let (judge, mut records) = (self.judge(), Vec::new());
         let accepted = found.by_ref().find_map(|(_, continued)| {
             let Continued { world_from_camera, length, .. } = continued;
             let BaselineLength { to, votes, .. } = length;
@@ -404,7 +404,7 @@ impl<'a> Mapper<'a> {
                 visibility: visibility(&self.model, to, &world_from_camera, &[]),
                 length: Some(length),
             };
-            Some((self.first_accepted(to, vec![hypothesis], &mut false, &mut records)?, continued))
+            Some((judge.first_accepted(to, vec![hypothesis], &mut false, &mut records)?, continued))
         });
         self.records.append(&mut records);
         for (pair, _) in found {
@@ -505,26 +505,32 @@ impl<'a> Mapper<'a> {
             })
             .collect();
         waiting.sort_by_key(|&(count, image)| (Reverse(count), image));
+        let judge = self.judge();
+        let (mut records, mut refused) = (Vec::new(), Vec::new());
         let mut best: Option<(ImageId, PoseHypothesis)> = None;
         // The first few in any case, the others until one is acceptable.
         let (few, others) = waiting.split_at(waiting.len().min(3));
         for tried in std::iter::once(few).chain(others.chunks(2)) {
             let poses: Vec<_> =
-                tried.par_iter().with_max_len(1).map(|&(_, image)| self.acceptable_pose(image)).collect();
-            for (&(count, image), (pose, mut records)) in tried.iter().zip(poses) {
-                self.records.append(&mut records);
+                tried.par_iter().with_max_len(1).map(|&(_, image)| judge.acceptable_pose(image)).collect();
+            for (&(count, image), (pose, mut of_image)) in tried.iter().zip(poses) {
+                records.append(&mut of_image);
                 match pose {
                     Some(pose) => {
                         if best.as_ref().is_none_or(|(_, other)| pose.inliers.len() > other.inliers.len()) {
                             best = Some((image, pose));
                         }
                     }
-                    None => self.refused_at[image.index()] = count,
+                    None => refused.push((count, image)),
                 }
             }
             if best.is_some() {
                 break;
             }
+        }
+        self.records.append(&mut records);
+        for (count, image) in refused {
+            self.refused_at[image.index()] = count;
         }
         best
     }
@@ -591,38 +597,21 @@ impl<'a> Mapper<'a> {
         Some(visibility(&self.model, image, &pose, &self.model.observations_of(image)))
     }
 
-    /// What an image sees of what it ought to, where it does not see that.
-    fn seen_if_misplaced(&self, image: ImageId) -> Option<Visibility> {
-        let pose = self.model.poses[image.index()]?.world_from_camera;
-        let observations = self.model.observations_of(image);
-        let seen = visibility(&self.model, image, &pose, &observations);
-        let judged = seen.expected >= self.params.min_visible_points;
-        let is_misplaced = match self.testimony(image, &pose, &observations) {
-            Some(testimony) => testimony.speaks_against(),
-            None => {
-                judged
-                    && !self.params.is_recognized(&seen)
-                    && !self.shares_as_neighbour(image, &pose)
-                    && !self.is_latecomer(image, &pose)
-                    && !self.is_held_by_pairs(image, &pose)
-            }
-        };
-        is_misplaced.then_some(seen)
-    }
-
     /// The place of the first of these images that does not see what it ought to.
     fn first_misplaced(&self, images: &[ImageId]) -> Option<(usize, Visibility)> {
         if self.model.registered_count() <= 3 {
             return None;
         }
-        let misplaced = |(at, &image): (usize, &ImageId)| Some((at, self.seen_if_misplaced(image)?));
+        let judge = self.judge();
+        let misplaced = |(at, &image): (usize, &ImageId)| Some((at, judge.seen_if_misplaced(image)?));
         images.par_iter().with_max_len(1).enumerate().find_map_first(misplaced)
     }
 
     /// How many of these images do not see what they ought to.
     fn misplaced_count(&self, images: impl Iterator<Item = ImageId>) -> usize {
         let images: Vec<ImageId> = images.collect();
-        let is_misplaced = |image: &ImageId| self.seen_if_misplaced(*image).is_some();
+        let judge = self.judge();
+        let is_misplaced = |image: &ImageId| judge.seen_if_misplaced(*image).is_some();
         images.into_par_iter().with_max_len(1).filter(is_misplaced).count()
     }
 

@@ -229,20 +229,21 @@ pub(super) fn is_indoors(model: &Model<'_>) -> bool {
     common_floor(known.into_iter()).zip(median(depths)).is_some_and(is_near)
 }
 
-/// Whether the matches of the pairs that are for a pose of an image lie on the floor, those that are well below the horizon, if
+/// Whether the matches of the pairs that are for a pose of an image lie on the floor of all images, those that are well below the horizon, if
 /// the image stands as high above it as all others.
 ///
 /// What a façade repeats is not the floor before it, unless that repeats itself, too: of 67 wrong pairs of two rendered streets none
 /// has four such matches (of 277 of plaza and floors of equal tiles two fifths do), of right pairs of a real house two thirds.
 pub(super) fn stands_on_floor(
     model: &Model<'_>,
+    floor: Option<Floor>,
     image: ImageId,
     world_from_camera: &Rigid,
     max_error_sigma: f64,
 ) -> bool {
-    let Some(floor) = floor_of_all(model) else { return false };
+    let Some(floor) = floor else { return false };
     let (mut on_floor, mut below) = (0, 0);
-    for pair in model.input.pairs {
+    for pair in model.pairs_of(image) {
         let Some((other, _)) = pair.seen_from(image) else { continue };
         let Some(pose) = &model.poses[other.index()] else { continue };
         let other_from_image = pose.world_from_camera.inverse() * *world_from_camera;

@@ -1,5 +1,7 @@
 //! What the mapper works on.
 
+use std::sync::Arc;
+
 use nalgebra::Vector3;
 use setloc_features::{Calibration, Camera, ImageFeatures, Match};
 
@@ -87,6 +89,26 @@ impl MapperInput<'_> {
     }
 }
 
+/// The verified pairs of each image, in their order: to look through all of them for one image takes long where there are many.
+#[derive(Debug, Clone)]
+pub(super) struct PairsByImage<'a>(Arc<Vec<Vec<&'a PairGeometry>>>);
+
+impl<'a> PairsByImage<'a> {
+    pub fn of(input: &MapperInput<'a>) -> Self {
+        let mut of_image = vec![Vec::new(); input.images.len()];
+        for pair in input.pairs {
+            for image in [pair.first, pair.second] {
+                of_image[image.index()].push(pair);
+            }
+        }
+        Self(Arc::new(of_image))
+    }
+
+    pub fn of_image(&self, image: ImageId) -> impl Iterator<Item = &'a PairGeometry> + '_ {
+        self.0[image.index()].iter().copied()
+    }
+}
+
 /// All matches of two images, before verification.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PutativePair {
@@ -96,4 +118,20 @@ pub struct PutativePair {
     pub second: ImageId,
     /// Its matches.
     pub matches: Vec<Match>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::test_street::{POINTS, Street};
+    use super::*;
+
+    #[test]
+    fn the_pairs_of_an_image_come_in_their_order() {
+        let street = Street::new("pairs", 60, POINTS);
+        let pairs = PairsByImage::of(&street.input());
+        let images = |of: u32| -> Vec<[u32; 2]> {
+            pairs.of_image(ImageId(of)).map(|pair| [pair.first.0, pair.second.0]).collect()
+        };
+        assert_eq!([images(0), images(1), images(2)], [[[0, 1], [0, 2]], [[0, 1], [1, 2]], [[0, 2], [1, 2]]]);
+    }
 }

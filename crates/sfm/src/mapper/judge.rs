@@ -1,11 +1,13 @@
 //! Which pose of an image is taken, if any.
 
+use std::sync::OnceLock;
+
 use super::{
     Mapper, RegistrationRecord,
-    depths::stands_on_floor,
+    depths::{Floor, floor_of_all, stands_on_floor},
     latecomers::{hypothesize_from_crossings, hypothesize_from_depths},
     neighbours::{Neighbours, neighbours, share_as_neighbours, share_with_one},
-    register::{PoseHypothesis, hypothesize, hypothesize_from_pairs},
+    register::{PoseHypothesis, Visibility, hypothesize, hypothesize_from_pairs, visibility},
     support::{Support, Worth},
     witnesses::{Testimony, count_agreeing},
 };
@@ -14,42 +16,48 @@ use crate::{ImageId, PointId, Rigid, robust::RansacParams};
 /// Share of a pair's matches on the epipolar circles of a pose that make it agree with that pose.
 const MIN_ON_CIRCLES: f64 = 0.9;
 
-impl Mapper<'_> {
+/// Who judges poses in a model, and what is known of all of it for that: counted when something asks, and then kept, as nothing
+/// changes the model meanwhile.
+pub(super) struct Judge<'m, 'a> {
+    mapper: &'m Mapper<'a>,
+    worth: OnceLock<Worth>,
+    floor: OnceLock<Option<Floor>>,
+}
+
+impl Judge<'_, '_> {
     /// A pose that may be taken, and what was thought of it and those before.
     pub(super) fn acceptable_pose(
         &self,
         image: ImageId,
     ) -> (Option<PoseHypothesis>, Vec<RegistrationRecord>) {
-        let mut records = Vec::new();
+        let Mapper { params, model, graph, taken, .. } = self.mapper;
+        let (sigmas, mut records) = (params.max_error_sigma, Vec::new());
         let mut has_rival = false;
-        let seed = self.seed ^ (u64::from(image.0) << 32);
-        let ransac = self.params.ransac();
-        let resected =
-            hypothesize(&self.model, &self.graph, image, &ransac, self.params.max_pose_hypotheses, seed);
+        let seed = self.mapper.seed ^ (u64::from(image.0) << 32);
+        let ransac = params.ransac();
+        let resected = hypothesize(model, graph, image, &ransac, params.max_pose_hypotheses, seed);
         let pose = self.first_accepted(image, resected, &mut has_rival, &mut records).or_else(|| {
-            let confirmed = RansacParams { min_inliers: self.params.min_confirmed_inliers, ..ransac };
-            let mut from_pairs = hypothesize_from_pairs(&self.model, &self.graph, image, &confirmed);
+            let confirmed = RansacParams { min_inliers: params.min_confirmed_inliers, ..ransac };
+            let mut from_pairs = hypothesize_from_pairs(model, graph, image, &confirmed);
             from_pairs.retain(|pose| {
-                pose.inliers.len() as f64 >= self.params.min_confirmed_share * pose.candidates as f64
-                    || pose.inliers.len() >= self.params.min_registration_inliers
+                pose.inliers.len() as f64 >= params.min_confirmed_share * pose.candidates as f64
+                    || pose.inliers.len() >= params.min_registration_inliers
             });
-            from_pairs.truncate(self.params.max_pose_hypotheses);
+            from_pairs.truncate(params.max_pose_hypotheses);
             self.first_accepted(image, from_pairs, &mut has_rival, &mut records)
         });
         let pose = pose.or_else(|| {
-            let crossed = (self.admits_latecomers).then(|| {
-                let sigmas = self.params.max_error_sigma;
-                hypothesize_from_crossings(&self.model, &self.graph, &self.taken, image, sigmas)
-            })?;
+            let crossed = (self.mapper.admits_latecomers)
+                .then(|| hypothesize_from_crossings(model, graph, taken, image, sigmas))?;
             // Two directions nearly always cross somewhere.
             let pose = crossed.filter(|pose| self.is_latecomer(image, &pose.world_from_camera))?;
             self.first_accepted(image, vec![pose], &mut has_rival, &mut records)
         });
         let pose = pose.or_else(|| {
-            let hung = self.admits_by_depths.then(|| {
-                let sigmas = self.params.max_error_sigma;
-                hypothesize_from_depths(&self.model, &self.graph, &self.taken, image, sigmas)
-            })?;
+            let hung = self
+                .mapper
+                .admits_by_depths
+                .then(|| hypothesize_from_depths(model, self.floor(), graph, taken, image, sigmas))?;
             let pose = hung.filter(|pose| self.may_hang(image, &pose.world_from_camera))?;
             self.first_accepted(image, vec![pose], &mut has_rival, &mut records)
         });
@@ -64,23 +72,24 @@ impl Mapper<'_> {
         has_rival: &mut bool,
         records: &mut Vec<RegistrationRecord>,
     ) -> Option<PoseHypothesis> {
+        let Mapper { params, model, .. } = self.mapper;
         let mut refused_before = false;
         for hypothesis in hypotheses {
             let seen = hypothesis.visibility;
-            let judged = seen.expected >= self.params.min_visible_points;
+            let judged = seen.expected >= params.min_visible_points;
             // Where a better supported pose was refused for what it does not see, this one needs evidence of its own.
-            let testimony = self.testimony(image, &hypothesis.world_from_camera, &hypothesis.inliers);
+            let testimony = self.mapper.testimony(image, &hypothesis.world_from_camera, &hypothesis.inliers);
             let plausible = match testimony {
                 Some(testimony) => testimony.speaks_for(),
-                None if judged => self.params.is_recognized(&seen),
+                None if judged => params.is_recognized(&seen),
                 None => !refused_before,
             };
             let plausible = plausible
                 || hypothesis.length.is_some() && self.may_hang(image, &hypothesis.world_from_camera)
                 || self.is_latecomer(image, &hypothesis.world_from_camera);
             refused_before |= !plausible;
-            let is_contradicted = self.model.input.is_panoramic(image) && {
-                let support = self.support(image, &hypothesis.world_from_camera);
+            let is_contradicted = model.input.is_panoramic(image) && {
+                let support = self.mapper.support(image, &hypothesis.world_from_camera);
                 let is_contradicted =
                     support.is_untenable() || (*has_rival || !judged) && support.is_contradicted();
                 *has_rival |= support.is_clear();
@@ -88,8 +97,8 @@ impl Mapper<'_> {
             };
             let accepted = plausible
                 && !is_contradicted
-                && self.pair_agreement(image, &hypothesis.world_from_camera)
-                    >= self.params.min_pair_agreement;
+                && self.mapper.pair_agreement(image, &hypothesis.world_from_camera)
+                    >= params.min_pair_agreement;
             let (candidates, inliers) = (hypothesis.candidates, hypothesis.inliers.len());
             records.push(RegistrationRecord::new(image, accepted, [candidates, inliers], &seen));
             if accepted {
@@ -97,6 +106,82 @@ impl Mapper<'_> {
             }
         }
         None
+    }
+
+    /// Whether an image may come in late at a pose.
+    fn is_latecomer(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        if !self.mapper.admits_latecomers {
+            return false;
+        }
+        let support = self.mapper.support(image, world_from_camera);
+        support.is_enough(self.mapper.params.min_initial_points)
+            && (support.is_strong() && self.believes(support.widest)
+                || self.mapper.shares_with_one(image, world_from_camera))
+    }
+
+    /// Whether an image may hang at a pose by one pair whose length depths tell.
+    fn may_hang(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        let sigmas = self.mapper.params.max_error_sigma;
+        self.right_support(image, world_from_camera).is_some_and(|support| {
+            support.is_strong()
+                || self.mapper.shares_with_one(image, world_from_camera)
+                || stands_on_floor(&self.mapper.model, self.floor(), image, world_from_camera, sigmas)
+        })
+    }
+
+    /// Whether a registered image is held by pairs such as are right in this model, whatever walls hide from it.
+    ///
+    /// Less is asked than of one that comes in by a pair ([`Self::may_hang`]): when two parts become one that a door joins, each
+    /// image ought to see by all that is in plain view what stands in the other's rooms.
+    fn is_held_by_pairs(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
+        self.right_support(image, world_from_camera).is_some()
+    }
+
+    /// What the pairs say for a pose where images may come in by depths, if it is enough and such pairs are right in this model.
+    fn right_support(&self, image: ImageId, world_from_camera: &Rigid) -> Option<Support> {
+        if !self.mapper.admits_by_depths {
+            return None;
+        }
+        let support = self.mapper.support(image, world_from_camera);
+        let is_right = support.is_enough_if_right() && self.believes(support.widest);
+        is_right.then_some(support)
+    }
+
+    /// What an image sees of what it ought to, where it does not see that.
+    pub(super) fn seen_if_misplaced(&self, image: ImageId) -> Option<Visibility> {
+        let Mapper { params, model, .. } = self.mapper;
+        let pose = model.poses[image.index()]?.world_from_camera;
+        let observations = model.observations_of(image);
+        let seen = visibility(model, image, &pose, &observations);
+        let judged = seen.expected >= params.min_visible_points;
+        let is_misplaced = match self.mapper.testimony(image, &pose, &observations) {
+            Some(testimony) => testimony.speaks_against(),
+            None => {
+                judged
+                    && !params.is_recognized(&seen)
+                    && !self.mapper.shares_as_neighbour(image, &pose)
+                    && !self.is_latecomer(image, &pose)
+                    && !self.is_held_by_pairs(image, &pose)
+            }
+        };
+        is_misplaced.then_some(seen)
+    }
+
+    /// Whether pairs that are so spread are right in the model.
+    fn believes(&self, spread: usize) -> bool {
+        let Mapper { model, params, .. } = self.mapper;
+        self.worth.get_or_init(|| Worth::of(&[model], params.max_error_sigma)).believes(spread)
+    }
+
+    fn floor(&self) -> Option<Floor> {
+        *self.floor.get_or_init(|| floor_of_all(&self.mapper.model))
+    }
+}
+
+impl<'a> Mapper<'a> {
+    /// Who judges poses in the model as it is.
+    pub(super) fn judge(&self) -> Judge<'_, 'a> {
+        Judge { mapper: self, worth: OnceLock::new(), floor: OnceLock::new() }
     }
 
     /// What those say that judge poses in place of what is in plain view; `None` where nobody does.
@@ -113,46 +198,6 @@ impl Mapper<'_> {
     /// What the verified pairs of an image say of a pose.
     pub(super) fn support(&self, image: ImageId, world_from_camera: &Rigid) -> Support {
         Support::of(&self.model, &self.taken, image, world_from_camera, self.params.max_error_sigma)
-    }
-
-    /// Whether an image may come in late at a pose.
-    pub(super) fn is_latecomer(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
-        if !self.admits_latecomers {
-            return false;
-        }
-        let support = self.support(image, world_from_camera);
-        let is_believed = || Worth::of(&[&self.model], self.params.max_error_sigma).believes(support.widest);
-        support.is_enough(self.params.min_initial_points)
-            && (support.is_strong() && is_believed() || self.shares_with_one(image, world_from_camera))
-    }
-
-    /// Whether an image may hang at a pose by one pair whose length depths tell.
-    fn may_hang(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
-        let sigmas = self.params.max_error_sigma;
-        self.right_support(image, world_from_camera).is_some_and(|support| {
-            support.is_strong()
-                || self.shares_with_one(image, world_from_camera)
-                || stands_on_floor(&self.model, image, world_from_camera, sigmas)
-        })
-    }
-
-    /// Whether a registered image is held by pairs such as are right in this model, whatever walls hide from it.
-    ///
-    /// Less is asked than of one that comes in by a pair ([`Self::may_hang`]): when two parts become one that a door joins, each
-    /// image ought to see by all that is in plain view what stands in the other's rooms.
-    pub(super) fn is_held_by_pairs(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
-        self.right_support(image, world_from_camera).is_some()
-    }
-
-    /// What the pairs say for a pose where images may come in by depths, if it is enough and such pairs are right in this model.
-    fn right_support(&self, image: ImageId, world_from_camera: &Rigid) -> Option<Support> {
-        if !self.admits_by_depths {
-            return None;
-        }
-        let support = self.support(image, world_from_camera);
-        let is_right = support.is_enough_if_right()
-            && Worth::of(&[&self.model], self.params.max_error_sigma).believes(support.widest);
-        is_right.then_some(support)
     }
 
     fn shares_with_one(&self, image: ImageId, world_from_camera: &Rigid) -> bool {
@@ -197,7 +242,7 @@ impl Mapper<'_> {
             return 1.0;
         }
         let (mut agreeing, mut all) = (0, 0);
-        for pair in self.model.input.pairs {
+        for pair in self.model.pairs_of(image) {
             let Some((other, measured)) = pair.seen_from(image) else { continue };
             let Some(pose) = &self.model.poses[other.index()] else { continue };
             let image_from_other = world_from_camera.inverse() * pose.world_from_camera;

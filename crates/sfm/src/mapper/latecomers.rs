@@ -15,9 +15,10 @@ use std::{cmp::Reverse, f64::consts::PI};
 use nalgebra::Vector3;
 
 use super::{
-    MapperInput, Part,
+    Part,
     correspondence::CorrespondenceGraph,
-    depths,
+    depths::{self, Floor},
+    input::PairsByImage,
     model::Model,
     register::PoseHypothesis,
     support::{MIN_FOR, Support},
@@ -47,15 +48,19 @@ const MIN_CROSSING_RAD: f64 = 0.1;
 ///
 /// In a rendered floor the strongest pair of each of four images of a part that was wrong in itself (4.2 m) had 48 to 99 matches
 /// within it and 272 to 310 with an image of another part; of right parts it is within.
-pub(super) fn may_be_left(input: &MapperInput<'_>, part: &Part) -> bool {
+pub(super) fn may_be_left(pairs: &PairsByImage<'_>, part: &Part) -> bool {
     part.size() <= FEW_IMAGES
-        || part.component.registered().all(|image| belongs_elsewhere(input, part, image))
+        || part.component.registered().all(|image| belongs_elsewhere(pairs.of_image(image), part, image))
 }
 
-/// Whether the strongest pair of an image of a part is by far with an image that the part does not hold.
-pub(super) fn belongs_elsewhere(input: &MapperInput<'_>, part: &Part, image: ImageId) -> bool {
+/// Whether the strongest of the pairs of an image of a part is by far with an image that the part does not hold.
+pub(super) fn belongs_elsewhere<'p>(
+    pairs: impl Iterator<Item = &'p PairGeometry>,
+    part: &Part,
+    image: ImageId,
+) -> bool {
     let mut strongest = [0; 2];
-    for pair in input.pairs {
+    for pair in pairs {
         let Some((other, _)) = pair.seen_from(image) else { continue };
         let is_within = part.component.images[other.index()].world_from_camera.is_some();
         let most = &mut strongest[usize::from(is_within)];
@@ -148,15 +153,15 @@ fn agreed_by_pairs(model: &Model<'_>, image: ImageId, pose: &Rigid, max_error_si
     refine_pose_from_views(&RansacParams { max_error_sigma, ..RansacParams::default() }, &views, pose)
 }
 
-/// The pose by one verified pair whose length depths tell ([`depths`]) that most speaks for.
+/// The pose by one verified pair whose length depths tell ([`depths`]), above the floor of all images, that most speaks for.
 pub(super) fn hypothesize_from_depths(
     model: &Model<'_>,
+    floor: Option<Floor>,
     graph: &CorrespondenceGraph,
     taken: &[bool],
     image: ImageId,
     max_error_sigma: f64,
 ) -> Option<PoseHypothesis> {
-    let floor = depths::floor_of_all(model);
     let mut best: Option<(usize, Rigid, BaselineLength)> = None;
     for pair in pairs_with(model, image).into_iter().take(CROSSED_PAIRS) {
         let Some((other, image_from_other)) = pair.seen_from(image) else { continue };
@@ -193,13 +198,13 @@ pub(super) fn count_held_by_pairs(model: &Model<'_>, image: ImageId) -> usize {
 }
 
 /// The verified pairs with parallax of an image with registered ones, strongest first.
-fn pairs_with<'m>(model: &'m Model<'_>, image: ImageId) -> Vec<&'m PairGeometry> {
+fn pairs_with<'a>(model: &Model<'a>, image: ImageId) -> Vec<&'a PairGeometry> {
     let is_open = |pair: &&PairGeometry| {
         let other = pair.seen_from(image).map(|(other, _)| other);
         other.is_some_and(|other| model.is_registered(other))
             && pair.two_view.kind != TwoViewKind::PureRotation
     };
-    let mut pairs: Vec<&PairGeometry> = model.input.pairs.iter().filter(is_open).collect();
+    let mut pairs: Vec<&PairGeometry> = model.pairs_of(image).filter(is_open).collect();
     pairs.sort_by_key(|pair| (Reverse(pair.two_view.inliers.len()), pair.first, pair.second));
     pairs
 }
@@ -226,6 +231,7 @@ mod tests {
     use nalgebra::UnitQuaternion;
     use setloc_features::{Camera, ImageFeatures};
 
+    use super::super::MapperInput;
     use super::*;
     use crate::{CameraId, Reconstruction, ReconstructionImage, TwoView};
 
@@ -281,7 +287,7 @@ mod tests {
         };
         let images = (0..6).map(image).collect();
         let component = Reconstruction { cameras: vec![camera], images, ..Reconstruction::default() };
-        may_be_left(&input, &Part { component, anchors: vec![None; 6] })
+        may_be_left(&PairsByImage::of(&input), &Part { component, anchors: vec![None; 6] })
     }
 
     #[test]

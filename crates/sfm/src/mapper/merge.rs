@@ -731,7 +731,7 @@ impl<'a> Attempt<'_, '_, 'a> {
         }
         mapper.replace_misplaced();
         // Where a part ends an image may have come in askew by a few points, which the other part has hundreds of matches with.
-        let may_leave = |part: &Part, image| belongs_elsewhere(mapper.model.input, part, image);
+        let may_leave = |part: &Part, image| belongs_elsewhere(mapper.model.pairs_of(image), part, image);
         let num_lost = |of: &Part| {
             let images = of.component.registered();
             images.filter(|image| !mapper.model.is_registered(*image) && !may_leave(of, *image)).count()

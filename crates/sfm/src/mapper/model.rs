@@ -2,10 +2,10 @@ use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use setloc_features::{Camera, Rays};
 
-use super::{InputImage, MapperInput};
+use super::{InputImage, MapperInput, input::PairsByImage};
 use crate::{
-    BaselineLength, ImageId, Observation, PointId, Reconstruction, ReconstructionImage, ReconstructionPoint,
-    Rigid, Similarity,
+    BaselineLength, ImageId, Observation, PairGeometry, PointId, Reconstruction, ReconstructionImage,
+    ReconstructionPoint, Rigid, Similarity,
     solvers::triangulation::{WorldRay, triangulate},
     visibility::is_same_view,
 };
@@ -47,6 +47,7 @@ pub(super) struct Model<'a> {
     /// Lengths of baselines that the points do not tell.
     pub lengths: Vec<BaselineLength>,
     point_of_feature: Vec<Vec<u32>>,
+    pairs: PairsByImage<'a>,
     /// The images that each was matched with, ascending; `None` where nothing is said of them.
     matched: Option<Vec<Vec<ImageId>>>,
 }
@@ -131,6 +132,7 @@ impl<'a> Model<'a> {
             points: Vec::new(),
             lengths: Vec::new(),
             point_of_feature: input.images.iter().map(|image| vec![NO_POINT; image.features.len()]).collect(),
+            pairs: PairsByImage::of(input),
             matched: (!input.putative.is_empty()).then(|| {
                 let mut matched = vec![Vec::new(); input.images.len()];
                 for pair in input.putative {
@@ -155,6 +157,11 @@ impl<'a> Model<'a> {
             }
             None => self.registered().filter(|&other| other != image).collect(),
         }
+    }
+
+    /// The verified pairs of an image.
+    pub fn pairs_of(&self, image: ImageId) -> impl Iterator<Item = &'a PairGeometry> + '_ {
+        self.pairs.of_image(image)
     }
 
     pub fn is_registered(&self, image: ImageId) -> bool {

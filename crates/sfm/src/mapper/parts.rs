@@ -5,8 +5,8 @@ use std::{cmp::Reverse, collections::BTreeSet};
 use nalgebra::UnitQuaternion;
 
 use super::{
-    Mapper, MapperInput, MapperOutput, MapperParams, MapperReport, latecomers::may_be_left, merge::PartState,
-    model::Model, projection, witnesses::Witnesses,
+    Mapper, MapperInput, MapperOutput, MapperParams, MapperReport, input::PairsByImage,
+    latecomers::may_be_left, merge::PartState, model::Model, projection, witnesses::Witnesses,
 };
 use crate::{ImageId, Reconstruction, ReconstructionImage};
 
@@ -140,15 +140,16 @@ impl<'a> Parts<'a> {
         if !(0..self.input.images.len() as u32).any(|image| self.input.is_panoramic(ImageId(image))) {
             return;
         }
+        let pairs = PairsByImage::of(self.input);
         let mut at = 0;
         while at < self.all.len() {
-            let is_open = |other: &usize| *other == at || may_be_left(self.input, &self.all[*other]);
+            let is_open = |other: &usize| *other == at || may_be_left(&pairs, &self.all[*other]);
             let open: Vec<usize> = (0..self.all.len()).filter(is_open).collect();
             let taken = self.taken_by_all_but(&open);
             let part = &self.all[at];
             let waits =
                 |(image, taken): (&ReconstructionImage, &bool)| image.world_from_camera.is_none() && !taken;
-            if may_be_left(self.input, part) || !part.component.images.iter().zip(&taken).any(waits) {
+            if may_be_left(&pairs, part) || !part.component.images.iter().zip(&taken).any(waits) {
                 at += 1;
                 continue;
             }

@@ -201,7 +201,7 @@ pub(super) fn hypothesize_from_pairs(
         (0..points.len()).filter(agrees).map(|index| index as u32).collect()
     };
     let mut hypotheses = Vec::new();
-    for pair in model.input.pairs {
+    for pair in model.pairs_of(image) {
         let Some((other, image_from_other)) = pair.seen_from(image) else { continue };
         let Some(pose) = &model.poses[other.index()] else { continue };
         if pair.two_view.kind == TwoViewKind::PureRotation {

@@ -114,7 +114,7 @@ impl Support {
                 Some(model.poses[of.index()]?.world_from_camera)
             }
         };
-        let asked = ask(model, |pair| pair.seen_from(image).is_some(), pose, max_error_sigma);
+        let asked = ask(model, model.pairs_of(image), pose, max_error_sigma);
         let mut support =
             Self { directions: Some(directions(model, image, asked.values())), ..Self::default() };
         for ([first, second], said) in asked {
@@ -144,17 +144,19 @@ impl Support {
 
     /// Asks the pairs between some images of a model and all others.
     pub fn across(model: &Model<'_>, is_inside: impl Fn(ImageId) -> bool, max_error_sigma: f64) -> Self {
-        let crosses = |pair: &PairGeometry| is_inside(pair.first) != is_inside(pair.second);
-        Self::by(model, crosses, max_error_sigma)
+        let crosses = |pair: &&PairGeometry| is_inside(pair.first) != is_inside(pair.second);
+        Self::by(model, model.input.pairs.iter().filter(crosses), max_error_sigma)
     }
 
-    /// Asks those pairs between images of a model that `counts` chooses.
-    pub fn by(model: &Model<'_>, counts: impl Fn(&PairGeometry) -> bool, max_error_sigma: f64) -> Self {
+    /// Asks those of some pairs that are between images of a model.
+    pub fn by<'p>(
+        model: &Model<'_>,
+        pairs: impl Iterator<Item = &'p PairGeometry>,
+        max_error_sigma: f64,
+    ) -> Self {
         let pose = |of: ImageId| Some(model.poses[of.index()]?.world_from_camera);
-        let is_asked = |pair: &PairGeometry| {
-            [pair.first, pair.second].iter().all(|&image| model.is_registered(image)) && counts(pair)
-        };
-        Self::of_said(ask(model, is_asked, pose, max_error_sigma).values())
+        let asked = pairs.filter(|pair| is_within(model, pair));
+        Self::of_said(ask(model, asked, pose, max_error_sigma).values())
     }
 
     fn of_said<'s>(all: impl Iterator<Item = &'s PairSays<'s>>) -> Self {
@@ -187,29 +189,43 @@ pub(super) fn most_contradicted(
         return None;
     }
     let pose = |of: ImageId| Some(model.poses[of.index()]?.world_from_camera);
-    let is_inside = |pair: &PairGeometry| [pair.first, pair.second].iter().all(|&of| model.is_registered(of));
-    let said = ask(model, is_inside, pose, max_error_sigma);
+    let inside = model.input.pairs.iter().filter(|pair| is_within(model, pair));
+    let said = ask(model, inside, pose, max_error_sigma);
+    let mut said_of: Vec<Vec<(&[ImageId; 2], &PairSays<'_>)>> = vec![Vec::new(); model.poses.len()];
+    for (images, said) in &said {
+        for image in images {
+            said_of[image.index()].push((images, said));
+        }
+    }
     let mut ties: Vec<(usize, [ImageId; 2])> =
         said.iter().map(|(images, said)| (said.agreeing.matches, *images)).collect();
     ties.retain(|(matches, _)| *matches > 0);
     ties.sort_unstable_by_key(|&(matches, images)| (Reverse(matches), images));
     let mut group_of: Vec<usize> = (0..model.poses.len()).collect();
+    let mut members: Vec<Vec<ImageId>> =
+        (0..model.poses.len() as u32).map(|image| vec![ImageId(image)]).collect();
     let mut groups: Vec<Vec<ImageId>> = model.registered().map(|image| vec![image]).collect();
     for (_, images) in ties {
         let [into, from] = images.map(|image| group_of[image.index()]);
         if into == from {
             continue;
         }
-        let members = || model.registered().filter(|image| [into, from].contains(&group_of[image.index()]));
-        if members().nth(max_images).is_none() {
-            groups.push(members().collect());
+        let joining = std::mem::take(&mut members[from]);
+        for image in &joining {
+            group_of[image.index()] = into;
         }
-        group_of.iter_mut().filter(|of| **of == from).for_each(|of| *of = into);
+        members[into].extend(joining);
+        if members[into].len() <= max_images {
+            let mut group = members[into].clone();
+            group.sort_unstable();
+            groups.push(group);
+        }
     }
     let mut most: Option<(f64, Vec<ImageId>)> = None;
     for group in groups.into_iter().filter(|group| group.iter().all(|&image| may_leave(image))) {
-        let crosses = |images: &&[ImageId; 2]| group.contains(&images[0]) != group.contains(&images[1]);
-        let across = || said.iter().filter(|(images, _)| crosses(images)).map(|(_, said)| said);
+        let crosses = |images: &[ImageId; 2]| group.contains(&images[0]) != group.contains(&images[1]);
+        let of_members = || group.iter().flat_map(|image| &said_of[image.index()]);
+        let across = || of_members().filter(|(images, _)| crosses(images)).map(|(_, said)| *said);
         let mut support = Support::of_said(across());
         if let [image] = group[..] {
             support.directions = Some(directions(model, image, across()));
@@ -237,14 +253,15 @@ fn matches_for_another_place(
     place: &Rigid,
     max_error_sigma: f64,
 ) -> usize {
-    let counts = |pair: &PairGeometry| {
+    let leads_away = |pair: &&PairGeometry| {
         let other = pair.seen_from(image).map(|(other, _)| other);
         other.is_some_and(|other| model.is_registered(other) && !group.contains(&other))
     };
+    let pairs = || model.pairs_of(image).filter(leads_away);
     let current = |of: ImageId| Some(model.poses[of.index()]?.world_from_camera);
     let other = |of: ImageId| if of == image { Some(*place) } else { current(of) };
-    let now = ask(model, counts, current, max_error_sigma);
-    let there = ask(model, counts, other, max_error_sigma);
+    let now = ask(model, pairs(), current, max_error_sigma);
+    let there = ask(model, pairs(), other, max_error_sigma);
     let is_moot = |images: &[ImageId; 2]| now.get(images).is_some_and(|said| said.agreeing.matches > 0);
     there.iter().filter(|(images, _)| !is_moot(images)).map(|(_, said)| said.agreeing.matches).sum()
 }
@@ -345,15 +362,20 @@ struct PairSays<'p> {
     agreeing_pairs: Vec<&'p PairGeometry>,
 }
 
-/// What those pairs say that `counts` chooses; without a pose nothing agrees.
+/// Whether both images of a pair are registered.
+fn is_within(model: &Model<'_>, pair: &PairGeometry) -> bool {
+    model.is_registered(pair.first) && model.is_registered(pair.second)
+}
+
+/// What pairs say; without a pose nothing agrees.
 fn ask<'p>(
-    model: &Model<'p>,
-    counts: impl Fn(&PairGeometry) -> bool,
+    model: &Model<'_>,
+    pairs: impl Iterator<Item = &'p PairGeometry>,
     pose: impl Fn(ImageId) -> Option<Rigid>,
     max_error_sigma: f64,
 ) -> BTreeMap<[ImageId; 2], PairSays<'p>> {
     let mut said: BTreeMap<[ImageId; 2], PairSays<'p>> = BTreeMap::new();
-    for pair in model.input.pairs.iter().filter(|pair| counts(pair)) {
+    for pair in pairs {
         let agrees = pose(pair.first).zip(pose(pair.second)).is_some_and(|(first, second)| {
             is_for(model, pair, pair.second, &(second.inverse() * first), max_error_sigma)
         });
@@ -514,7 +536,7 @@ mod tests {
             let inliers = Vec::new();
             let pose =
                 PoseHypothesis { world_from_camera, inliers, candidates: 20, visibility, length: None };
-            mapper.first_accepted(ImageId(2), vec![pose], &mut false, &mut Vec::new()).is_some()
+            mapper.judge().first_accepted(ImageId(2), vec![pose], &mut false, &mut Vec::new()).is_some()
         };
         assert!(accepts(0.0) && !accepts(2.0));
     }

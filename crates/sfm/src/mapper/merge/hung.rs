@@ -88,7 +88,8 @@ impl<'a> Attempt<'_, '_, 'a> {
             if best.as_ref().is_none_or(|best| support.spread > best.support.spread) {
                 let image = lengths[0].to;
                 let pose = self.pose_in_kept(image, &kept_from_moved);
-                let is_on_floor = pose.is_some_and(|pose| stands_on_floor(&joint, image, &pose, sigmas));
+                let is_on_floor = pose
+                    .is_some_and(|pose| stands_on_floor(&joint, floor_of_all(&joint), image, &pose, sigmas));
                 let strangers = self.strangers(&joint);
                 best = Some(Hung { kept_from_moved, lengths, support, is_on_floor, strangers });
             }
@@ -101,10 +102,11 @@ impl<'a> Attempt<'_, '_, 'a> {
     /// Two rooms that wrong pairs had joined would come in together where one of them belongs.
     fn strangers(&self, joint: &Model<'_>) -> Vec<ImageId> {
         let is_stranger = |&image: &ImageId| {
-            let counts = |pair: &PairGeometry| {
+            let leads_there = |pair: &&PairGeometry| {
                 pair.seen_from(image).is_some_and(|(other, _)| self.sides.kept.is_registered(other))
             };
-            Support::by(joint, counts, self.params.max_error_sigma).is_contradicted()
+            let pairs = joint.pairs_of(image).filter(leads_there);
+            Support::by(joint, pairs, self.params.max_error_sigma).is_contradicted()
         };
         self.sides.moved.registered().filter(is_stranger).collect()
     }
