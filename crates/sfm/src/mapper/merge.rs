@@ -14,8 +14,8 @@ mod likeness;
 mod similarity;
 
 use std::{
-    cell::OnceCell,
     collections::{BTreeMap, BTreeSet},
+    sync::OnceLock,
 };
 
 use rayon::prelude::*;
@@ -25,11 +25,11 @@ use setloc_features::GuidedParams;
 use self::{
     crossing::{Crossing, Sides, distinct, once},
     hung::Outcome,
-    likeness::{Likeness, likeness},
+    likeness::{Likeness, OwnRates, likeness},
     similarity::Sights,
 };
 use super::{
-    Mapper, MapperParams, MapperReport,
+    Mapper, MapperInput, MapperParams, MapperReport,
     depths::is_indoors,
     latecomers::belongs_elsewhere,
     model::Model,
@@ -185,21 +185,22 @@ const UNFIT_ONE_IN: usize = 8;
 /// Smallest share of each component's own observations that the adjustment of both together must keep.
 const MIN_KEPT_OBSERVATIONS: f64 = 0.9;
 
-impl Parts<'_> {
+impl<'a> Parts<'a> {
     /// Joins parts, largest first, as long as a similarity between two of them is supported.
     ///
     /// A whole is finished when nothing more joins it: that takes far longer than all else about a join.
     pub fn join_supported(&mut self) {
-        let mut tried = BTreeSet::new();
+        let (mut tried, mut models) = (BTreeSet::new(), ModelsOfParts::new());
         let mut joined_images = BTreeSet::new();
         loop {
             self.sort();
-            let found = self.first_joined(Evidence::Matches, &mut tried);
+            let found = self.first_joined(Evidence::Matches, &mut tried, &mut models);
             let Some((kept, moved, Outcome::Joined(joined))) = found else { break };
             joined_images.extend(joined.component.registered());
             self.all[kept] = joined;
             self.all.remove(moved);
         }
+        drop(models);
         for at in 0..self.all.len() {
             if self.all[at].component.registered().any(|image| joined_images.contains(&image)) {
                 self.rework(at, Mapper::finish);
@@ -210,11 +211,12 @@ impl Parts<'_> {
 
     /// Joins parts of panoramas by single pairs whose length depths tell, largest first; whether any were joined.
     pub fn join_hung(&mut self) -> bool {
-        let mut tried = BTreeSet::new();
+        let (mut tried, mut models) = (BTreeSet::new(), ModelsOfParts::new());
         let mut has_joined = false;
         loop {
             self.sort();
-            let Some((kept, moved, outcome)) = self.first_joined(Evidence::Depths, &mut tried) else { break };
+            let found = self.first_joined(Evidence::Depths, &mut tried, &mut models);
+            let Some((kept, moved, outcome)) = found else { break };
             match outcome {
                 Outcome::Joined(joined) => {
                     self.all[kept] = joined;
@@ -235,32 +237,45 @@ impl Parts<'_> {
         has_joined
     }
 
-    /// What comes of the first two parts that something comes of, and which these are.
+    /// What comes of the first two parts that something comes of, and which these are; their models are then forgotten, as they
+    /// change.
     fn first_joined(
         &mut self,
         by: Evidence,
         tried: &mut BTreeSet<[PartState; 2]>,
+        models: &mut ModelsOfParts<'a>,
     ) -> Option<(usize, usize, Outcome)> {
-        let (input, parts) = (self.input, &self.all);
-        let models: Vec<OnceCell<Model<'_>>> = parts.iter().map(|_| OnceCell::new()).collect();
-        let model = |at: usize| models[at].get_or_init(|| Model::of_component(input, &parts[at].component));
-        for (kept, larger) in parts.iter().enumerate() {
-            if matches!(by, Evidence::Depths) && !is_indoors(model(kept)) {
+        for part in &self.all {
+            models.entry(part.first()).or_default();
+        }
+        for (kept, larger) in self.all.iter().enumerate() {
+            let known = &models[&larger.first()];
+            if matches!(by, Evidence::Depths) && !is_indoors(known.model(self.input, larger)) {
                 continue;
             }
-            for (moved, smaller) in parts.iter().enumerate().skip(kept + 1) {
+            for (moved, smaller) in self.all.iter().enumerate().skip(kept + 1) {
                 if !tried.insert([larger.state(), smaller.state()]) {
                     continue;
                 }
                 let taken = self.taken_by_all_but(&[kept, moved]);
-                let sides = Sides { kept: model(kept), moved: model(moved) };
-                let attempt =
-                    Attempt { params: self.params, kept: larger, moved: smaller, sides, seed: self.seed };
+                let known = [(known, larger), (&models[&smaller.first()], smaller)];
+                let [of_kept, of_moved] = known.map(|(known, part)| known.model(self.input, part));
+                let attempt = Attempt {
+                    params: self.params,
+                    kept: larger,
+                    moved: smaller,
+                    sides: Sides { kept: of_kept, moved: of_moved },
+                    rates: known.map(|(known, _)| &known.rates),
+                    seed: self.seed,
+                };
                 let outcome = match by {
                     Evidence::Matches => attempt.run(taken, &mut self.report).map(Outcome::Joined),
                     Evidence::Depths => attempt.run_hung(taken, &mut self.report.merges),
                 };
                 if let Some(outcome) = outcome {
+                    for changed in [larger.first(), smaller.first()] {
+                        models.remove(&changed);
+                    }
                     return Some((kept, moved, outcome));
                 }
             }
@@ -271,6 +286,22 @@ impl Parts<'_> {
 
 /// What tells a part from all others and from itself before it grew: its first image and its size.
 pub(super) type PartState = (Option<ImageId>, usize);
+
+/// What was made of parts, by their first images: to make it takes long, and most parts stay as they are when two become one.
+type ModelsOfParts<'a> = BTreeMap<Option<ImageId>, ModelOfPart<'a>>;
+
+/// The model of a part and what its images see of its points, once something asks for it.
+#[derive(Default)]
+struct ModelOfPart<'a> {
+    model: OnceLock<Model<'a>>,
+    rates: OnceLock<OwnRates>,
+}
+
+impl<'a> ModelOfPart<'a> {
+    fn model(&self, input: &'a MapperInput<'a>, part: &Part) -> &Model<'a> {
+        self.model.get_or_init(|| Model::of_component(input, &part.component))
+    }
+}
 
 /// What parts are joined by.
 #[derive(Debug, Clone, Copy)]
@@ -283,7 +314,12 @@ enum Evidence {
 
 impl Part {
     pub(super) fn state(&self) -> PartState {
-        (self.component.registered().next(), self.size())
+        (self.first(), self.size())
+    }
+
+    /// Its first image; of two parts it is never the same.
+    fn first(&self) -> Option<ImageId> {
+        self.component.registered().next()
     }
 }
 
@@ -303,6 +339,8 @@ struct Attempt<'p, 'm, 'a> {
     kept: &'p Part,
     moved: &'p Part,
     sides: Sides<'m, 'a>,
+    /// Of the kept and the moved part.
+    rates: [&'m OnceLock<OwnRates>; 2],
     seed: u64,
 }
 
@@ -357,7 +395,7 @@ impl<'a> Attempt<'_, '_, 'a> {
 
     /// What became of the two, with nothing said of why.
     fn record(&self, verdict: MergeVerdict) -> MergeRecord {
-        let first_of = |part: &Part| part.component.registered().next().unwrap_or(ImageId(0));
+        let first_of = |part: &Part| part.first().unwrap_or(ImageId(0));
         MergeRecord {
             first_images: [first_of(self.kept), first_of(self.moved)],
             images: [self.kept.size(), self.moved.size()],
@@ -522,8 +560,11 @@ impl<'a> Attempt<'_, '_, 'a> {
         let Sides { kept, moved } = self.sides;
         let by_moved: Vec<_> = agreeing.iter().filter_map(|c| Some((c.moved.image, c.kept_point?))).collect();
         let by_kept: Vec<_> = agreeing.iter().filter_map(|c| Some((c.kept.image, c.moved_point?))).collect();
-        likeness(moved, kept, kept_from_moved, &by_moved)
-            + likeness(kept, moved, &kept_from_moved.inverse(), &by_kept)
+        let [of_kept, of_moved] = self.rates;
+        let kept_rated = (kept, of_kept.get_or_init(|| OwnRates::of(kept)));
+        let moved_rated = (moved, of_moved.get_or_init(|| OwnRates::of(moved)));
+        likeness(moved, kept_rated, kept_from_moved, &by_moved)
+            + likeness(kept, moved_rated, &kept_from_moved.inverse(), &by_kept)
     }
 
     /// What tells that the two are of one place, or why they are not joined.

@@ -46,6 +46,7 @@ pub(super) struct Model<'a> {
     pub points: Vec<Option<ModelPoint>>,
     /// Lengths of baselines that the points do not tell.
     pub lengths: Vec<BaselineLength>,
+    /// Empty of images that have no rays.
     point_of_feature: Vec<Vec<u32>>,
     pairs: PairsByImage<'a>,
     /// The images that each was matched with, ascending; `None` where nothing is said of them.
@@ -124,6 +125,9 @@ impl<'a> Model<'a> {
             if has_rays(index) { image.features.rays(camera) } else { Rays::default() }
         };
         let rays = input.images.par_iter().with_max_len(1).enumerate().map(rays_of).collect();
+        let no_points = |(index, image): (usize, &InputImage<'_>)| {
+            if has_rays(index) { vec![NO_POINT; image.features.len()] } else { Vec::new() }
+        };
         Self {
             input,
             cameras,
@@ -131,7 +135,7 @@ impl<'a> Model<'a> {
             poses: vec![None; input.images.len()],
             points: Vec::new(),
             lengths: Vec::new(),
-            point_of_feature: input.images.iter().map(|image| vec![NO_POINT; image.features.len()]).collect(),
+            point_of_feature: input.images.iter().enumerate().map(no_points).collect(),
             pairs: PairsByImage::of(input),
             matched: (!input.putative.is_empty()).then(|| {
                 let mut matched = vec![Vec::new(); input.images.len()];
@@ -182,7 +186,8 @@ impl<'a> Model<'a> {
     }
 
     pub fn point_of(&self, observation: Observation) -> Option<PointId> {
-        let id = self.point_of_feature[observation.image.index()][observation.feature as usize];
+        let of_image = &self.point_of_feature[observation.image.index()];
+        let id = of_image.get(observation.feature as usize).copied().unwrap_or(NO_POINT);
         (id != NO_POINT).then_some(PointId(id))
     }
 
@@ -429,4 +434,22 @@ pub(super) struct Triangulated {
     pub position: Vector3<f64>,
     pub max_error_sigma: f64,
     pub max_angle_rad: f64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::test_street::{POINTS, Street, first_two};
+    use super::*;
+
+    #[test]
+    fn images_outside_of_a_component_carry_no_points() {
+        let street = Street::new("outside", 60, POINTS);
+        let input = street.input();
+        let component = first_two(&street, &input).into_reconstruction();
+        let model = Model::of_component(&input, &component);
+        assert_eq!(model.observed_points(ImageId(0)), component.points.len());
+        let outside = ImageId(2);
+        assert!(model.carriers(outside).is_empty() && model.observations_of(outside).is_empty());
+        assert!(model.point_of(Observation { image: outside, feature: 0 }).is_none());
+    }
 }

@@ -53,76 +53,78 @@ fn alikeness(point: &Vector3<f64>, observer: &Vector3<f64>, candidate: &Vector3<
 /// The points that a camera at this pose ought to see much as a registered neighbour of the image does, with the bin of
 /// the likest view. Only points that the component would have without this image count.
 fn familiar(model: &Model<'_>, image: ImageId, world_from_camera: &Rigid) -> Vec<(PointId, usize)> {
-    let mut likest = vec![BINS; model.points.len()];
+    let mut likest: Vec<(PointId, usize)> = Vec::new();
     for other in model.registered_neighbours(image) {
         let Some(pose) = &model.poses[other.index()] else { continue };
-        for (_, id) in model.observations_of(other) {
-            let Some(point) = model.point(id) else { continue };
-            if let Some(bin) = alikeness(&point.position, pose.center(), &world_from_camera.translation) {
-                likest[id.index()] = likest[id.index()].min(bin);
-            }
-        }
+        likest.extend(model.observations_of(other).into_iter().filter_map(|(_, id)| {
+            let position = model.point(id)?.position;
+            Some((id, alikeness(&position, pose.center(), &world_from_camera.translation)?))
+        }));
     }
+    likest.sort_unstable();
+    likest.dedup_by_key(|(id, _)| *id);
     let counts = |id: PointId| {
         model.point(id).is_some_and(|point| {
             point.track.iter().filter(|seen| seen.image != image).count() >= 2
                 && is_in_view(model, image, world_from_camera, &point.position)
         })
     };
-    let points = likest.into_iter().enumerate().filter(|(_, bin)| *bin < BINS);
-    points.map(|(index, bin)| (PointId(index as u32), bin)).filter(|(id, _)| counts(*id)).collect()
+    likest.retain(|(id, _)| counts(*id));
+    likest
 }
 
 /// The share of such points that a component's own images see, by bin.
-fn own_rates(model: &Model<'_>) -> [f64; BINS] {
-    let images: Vec<ImageId> = model.registered().collect();
-    let counts: Vec<([usize; BINS], [usize; BINS])> = images
-        .into_par_iter()
-        .with_max_len(1)
-        .map(|image| {
-            let (mut expected, mut seen) = ([0; BINS], [0; BINS]);
-            let Some(pose) = &model.poses[image.index()] else { return (expected, seen) };
-            for (id, bin) in familiar(model, image, &pose.world_from_camera) {
-                expected[bin] += 1;
-                let sees = |point: &ModelPoint| point.track.iter().any(|seen| seen.image == image);
-                seen[bin] += usize::from(model.point(id).is_some_and(sees));
-            }
-            (expected, seen)
-        })
-        .collect();
-    let sum = |bin: usize| {
-        counts.iter().fold((0, 0), |(expected, seen), (e, s)| (expected + e[bin], seen + s[bin]))
-    };
-    let all = (0..BINS).map(sum).fold((0, 0), |all, bin| (all.0 + bin.0, all.1 + bin.1));
-    let mean = all.1 as f64 / all.0.max(1) as f64;
-    std::array::from_fn(|bin| {
-        let (expected, seen) = sum(bin);
-        (seen as f64 + PRIOR_POINTS * mean) / (expected as f64 + PRIOR_POINTS)
-    })
+pub(super) struct OwnRates([f64; BINS]);
+
+impl OwnRates {
+    pub fn of(model: &Model<'_>) -> Self {
+        let images: Vec<ImageId> = model.registered().collect();
+        let counts: Vec<([usize; BINS], [usize; BINS])> = images
+            .into_par_iter()
+            .with_max_len(1)
+            .map(|image| {
+                let (mut expected, mut seen) = ([0; BINS], [0; BINS]);
+                let Some(pose) = &model.poses[image.index()] else { return (expected, seen) };
+                for (id, bin) in familiar(model, image, &pose.world_from_camera) {
+                    expected[bin] += 1;
+                    let sees = |point: &ModelPoint| point.track.iter().any(|seen| seen.image == image);
+                    seen[bin] += usize::from(model.point(id).is_some_and(sees));
+                }
+                (expected, seen)
+            })
+            .collect();
+        let sum = |bin: usize| {
+            counts.iter().fold((0, 0), |(expected, seen), (e, s)| (expected + e[bin], seen + s[bin]))
+        };
+        let all = (0..BINS).map(sum).fold((0, 0), |all, bin| (all.0 + bin.0, all.1 + bin.1));
+        let mean = all.1 as f64 / all.0.max(1) as f64;
+        Self(std::array::from_fn(|bin| {
+            let (expected, seen) = sum(bin);
+            (seen as f64 + PRIOR_POINTS * mean) / (expected as f64 + PRIOR_POINTS)
+        }))
+    }
 }
 
-/// What the images of `of` match of the points of `at`, of which `matched` lists image and point.
+/// What the images of `of` match of the points of `at`, whose own images see them at these rates; `matched` lists image and point.
 pub(super) fn likeness(
     of: &Model<'_>,
-    at: &Model<'_>,
+    (at, rates): (&Model<'_>, &OwnRates),
     at_from_of: &Similarity,
     matched: &[(ImageId, PointId)],
 ) -> Likeness {
-    let rates = own_rates(at);
     let images: Vec<ImageId> = of.registered().collect();
     let counts: Vec<Likeness> = images
         .into_par_iter()
         .with_max_len(1)
         .map(|image| {
             let Some(pose) = &of.poses[image.index()] else { return Likeness::default() };
-            let mut is_matched = vec![false; at.points.len()];
-            for (_, id) in matched.iter().filter(|(seen_in, _)| *seen_in == image) {
-                is_matched[id.index()] = true;
-            }
+            let matched_here = matched.iter().filter(|(seen_in, _)| *seen_in == image);
+            let mut matched_here: Vec<PointId> = matched_here.map(|(_, id)| *id).collect();
+            matched_here.sort_unstable();
             let pose = at_from_of.transform_pose(&pose.world_from_camera);
             familiar(at, image, &pose).into_iter().fold(Likeness::default(), |sum, (id, bin)| {
-                let matched = f64::from(u8::from(is_matched[id.index()]));
-                sum + Likeness { expected: rates[bin], matched }
+                let matched = f64::from(u8::from(matched_here.binary_search(&id).is_ok()));
+                sum + Likeness { expected: rates.0[bin], matched }
             })
         })
         .collect();
@@ -132,6 +134,21 @@ pub(super) fn likeness(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mapper::test_street::{POINTS, Street, first_two};
+
+    #[test]
+    fn what_neighbours_see_is_familiar_once_by_the_likest_view() {
+        let street = Street::new("familiar", 60, POINTS);
+        let input = street.input();
+        let model = first_two(&street, &input);
+        let found = familiar(&model, ImageId(2), &street.poses[2]);
+        assert!(found.len() > 20 && found.is_sorted_by(|a, b| a.0 < b.0), "{found:?}");
+        for (id, bin) in found {
+            let position = model.point(id).expect("is there").position;
+            let alike = |pose: &Rigid| alikeness(&position, &pose.translation, &street.poses[2].translation);
+            assert_eq!(street.poses[..2].iter().filter_map(alike).min(), Some(bin));
+        }
+    }
 
     #[test]
     fn views_are_the_less_alike_the_farther_apart() {
