@@ -20,7 +20,7 @@ use crate::fingerprint::ContentHash;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
 use crate::stages;
 
-/// Bytes of grey images that are kept between cutting patches and finding them; further images are decoded twice.
+/// Bytes of grey images that are kept while patches are cut and found; what does not fit is decoded each time it is asked for.
 const KEPT_BYTES: usize = 1 << 30;
 /// Bytes a pixel of an image in work: decoded, grey and reduced.
 const WORKING_BYTES: u64 = 8;
