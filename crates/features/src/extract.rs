@@ -59,8 +59,8 @@ impl FeatureParams {
     /// 2: own SIFT, bright and dark spots apart. 3: simulated views. 4: large simulated views without their finest points.
     /// 5: weaker keypoints where there are few. 6: keypoints end at most five pixels from where they begin to be sought.
     /// 7: simulated views where there are few. 8: described on layers that are kept in steps of 1/256. 9: enlarged by a quarter in
-    /// place of doubled.
-    pub const VERSION: u32 = 9;
+    /// place of doubled. 10: black and white beside steep edges stay what they are.
+    pub const VERSION: u32 = 10;
 
     /// Whether [`extract_simulated_views`] finds more in an image than `own`: views of faint images are simulated from the first.
     pub fn adds_views_to(&self, own: &ImageFeatures) -> bool {

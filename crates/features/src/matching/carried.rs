@@ -52,7 +52,7 @@ struct Place {
 impl Place {
     fn of([first, second]: [&Keypoint; 2], [of_first, of_second]: [Elevations; 2]) -> Self {
         let [from, to] = [of_first.at(first.y), of_second.at(second.y)];
-        let azimuth = |keypoint: &Keypoint, elevations: Elevations| keypoint.x * elevations.per_row();
+        let azimuth = |keypoint: &Keypoint, elevations: Elevations| keypoint.x * elevations.per_column();
         let azimuth_in_first = azimuth(first, of_first).rem_euclid(TAU);
         let turned = (azimuth(second, of_second) - azimuth(first, of_first)).rem_euclid(TAU);
         let (highest, risen) = (from.max(to), (from - to).abs());

@@ -10,7 +10,7 @@ mod kernel;
 mod tiles;
 
 use std::collections::BTreeMap;
-use std::f32::consts::PI;
+use std::f32::consts::{PI, TAU};
 use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
@@ -77,8 +77,9 @@ impl MatchParams {
     /// 2: bright and dark spots apart, screened by the strongest. 3: simulated views. 4: which do not count among those
     /// that are worth screening. 5: without the last bit of descriptors; keypoints of level images that are turned alike.
     /// 6: small images are taken for level by their strongest keypoints, too. 7: keypoints of level images that can show the
-    /// same by height and size, too. 9: these in simulated views as well. 10: without logos below of another scale.
-    pub const VERSION: u32 = 10;
+    /// same by height and size, too. 9: these in simulated views as well. 10: without logos below of another scale. 11: across the seam of
+    /// panoramas that are not quite twice as wide as high, too.
+    pub const VERSION: u32 = 11;
 
     /// Checks the ranges.
     ///
@@ -140,19 +141,21 @@ impl Posture {
     }
 }
 
-/// Which elevation each row of a panorama shows.
+/// Which elevation each row of a panorama shows, and which part of the turn a column.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Elevations {
     /// Rows of the whole panorama, from pole to pole.
     rows: f32,
     /// How many of them are cropped above the image.
     top: f32,
+    /// Columns of the whole turn, about twice as many as rows.
+    columns: f32,
 }
 
 impl Elevations {
     fn of(camera: &Camera) -> Option<Self> {
         let (rows, top) = camera.half_turn_px()?;
-        Some(Self { rows: rows as f32, top: top as f32 })
+        Some(Self { rows: rows as f32, top: top as f32, columns: camera.full_turn_px()? as f32 })
     }
 
     /// The elevation that a row shows, in radians above the horizon.
@@ -163,6 +166,11 @@ impl Elevations {
     /// Radians that a row spans.
     fn per_row(self) -> f32 {
         PI / self.rows
+    }
+
+    /// Radians that a column spans on the horizon.
+    fn per_column(self) -> f32 {
+        TAU / self.columns
     }
 }
 

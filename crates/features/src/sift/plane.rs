@@ -111,7 +111,11 @@ vectorized! {
     fn keep(row: &[f32], target: &mut [Kept]) {
         // In floats of this size the last bit is worth 1; compilers turn conversions that must bear any number into single ones.
         const ROUNDING: f32 = 8_388_608.0;
+        // Beside steep edges enlarged images go below black and above white.
+        const WHITEST: f32 = Kept::MAX as f32 / STEPS;
         for (target, &value) in target.iter_mut().zip(row) {
+            let value = if value > 0.0 { value } else { 0.0 };
+            let value = if value < WHITEST { value } else { WHITEST };
             *target = (value * STEPS + ROUNDING).to_bits() as Kept;
         }
     }
@@ -120,6 +124,18 @@ vectorized! {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_below_black_or_above_white_is_kept_as_these() {
+        let row = [-0.09, -0.001, 0.0, 0.5, 254.99, 255.0, 255.99, 256.0, 256.6];
+        let mut kept = [0; 9];
+        keep(Level::detect(), &row, &mut kept);
+        let kept = kept.map(grey);
+        assert_eq!(kept[..4], [0.0, 0.0, 0.0, 0.5]);
+        for (kept, value) in kept.iter().zip(row).skip(4) {
+            assert!((kept - value.min(256.0)).abs() <= 1.0 / STEPS, "{kept} {value}");
+        }
+    }
 
     #[test]
     fn a_plane_passed_through_keeps_the_last_rows() {
