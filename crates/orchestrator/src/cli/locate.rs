@@ -99,7 +99,9 @@ pub fn locate_photos(args: &LocateArgs) -> Result<LocatedPhotos> {
     told.estimated_cameras().iter().for_each(|line| print::note(line));
     write_results(&args.output, &located, (&what.scene, scene_hash, &target), &told, &session)?;
     warn_skipped(&located.skipped);
-    note_of_frame(&what.scene).iter().for_each(|note| print::note(&format!("note: {note}")));
+    if let Some(note) = note_of_frame(&what.scene) {
+        print::note(&format!("note: {note}"));
+    }
     warn_of_scene(&what.scene.warnings);
     for advice in located.set.iter().flat_map(|set| &set.advice) {
         print::note(&format!("advice: {advice}"));

@@ -248,8 +248,11 @@ mod tests {
         records
     }
 
-    /// The number of every image, and the place and point of each of its keypoints.
-    fn images_of(folder: &Path) -> Vec<(u32, Vec<([f64; 2], u64)>)> {
+    /// The place and point of each keypoint of an image.
+    type Keypoints = Vec<([f64; 2], u64)>;
+
+    /// The number of every image, and its keypoints.
+    fn images_of(folder: &Path) -> Vec<(u32, Keypoints)> {
         read_part(folder, "images", |bytes| {
             let image = bytes.u32()?;
             bytes.skip(7 * 8 + 4)?;

@@ -43,7 +43,7 @@ pub fn scene_json(scene: &SceneFile) -> Value {
                         "wgs84": pose.and_then(|pose| wgs84_json(pose, component, scene)),
                         "wgs84_sigma": pose.zip(sigma).and_then(|(pose, sigma)| MapSigma::of(pose, sigma, component, scene)),
                         "camera": model.camera_of(id), "observations": observations[id.index()],
-                        "sigma": sigma.map(Sigma::to_json),
+                        "sigma": sigma.map(Sigma::as_json),
                         "grown": grown.contains(image.name.as_str()),
                     })
                 })
@@ -101,7 +101,7 @@ impl Sigma {
         deviation(&self.center)
     }
 
-    fn to_json(&self) -> Value {
+    fn as_json(&self) -> Value {
         json!({ "rotation_deg": self.rotation_rad.to_degrees(), "position": self.position() })
     }
 }
@@ -199,7 +199,7 @@ pub fn localization_json(photo: &PhotoLocalization, scene: &SceneFile) -> Value 
         "world_from_camera": pose.map(pose_json),
         "wgs84": pose.and_then(|pose| wgs84_json(pose, photo.component, scene)),
         "wgs84_sigma": MapSigma::of_photo(photo, scene), "camera": photo.camera,
-        "covariance_rotation_rad_then_centre": covariance, "sigma": sigma.map(|sigma| sigma.to_json()),
+        "covariance_rotation_rad_then_centre": covariance, "sigma": sigma.map(|sigma| sigma.as_json()),
     })
 }
 
