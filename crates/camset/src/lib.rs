@@ -22,6 +22,7 @@ mod evidence;
 mod grow;
 mod guided;
 mod jackknife;
+mod misfit;
 mod observability;
 mod params;
 mod pictures;
@@ -78,7 +79,8 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// joint refinement leaves behind are where they are alone. 49: sets whose photos look otherwise than the scene are uncertain.
 /// 50: photos among stitched panoramas are stretched as windows of these are. 51: photos that their set leaves with fewer of their
 /// scene points stand as they do alone. 52: unknown focal lengths by P4Pf, too. 53: told focal lengths are asked for by the joint refinement.
-pub const VERSION: u32 = 53;
+/// 54: and by photos alone; what residuals have in common makes poses uncertain.
+pub const VERSION: u32 = 54;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 /// 2: points shift to where moved rays meet.

@@ -70,6 +70,8 @@ pub struct SingleParams {
     pub covisible_images: usize,
     /// Most samples that RANSAC draws for one hypothesis; fewer give up earlier on photos of other places.
     pub max_samples: u32,
+    /// Whether intrinsics that are told are replaced where the photo clearly shows others.
+    pub check_intrinsics: bool,
     /// Search around projections once a pose is known.
     pub guided: GuidedParams,
     /// When the pose may be used.
@@ -83,6 +85,7 @@ impl Default for SingleParams {
             max_error_sigmas: 4.0,
             covisible_images: 3,
             max_samples: 10_000,
+            check_intrinsics: true,
             guided: GuidedParams::default(),
             verdict: VerdictParams::default(),
         }

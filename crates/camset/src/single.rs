@@ -9,6 +9,7 @@ use setloc_sfm::robust::{RansacParams, estimate_absolute_pose};
 use self::fit::{Fit, Sought};
 use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
 use crate::guided::guided_matches;
+use crate::misfit::Misfit;
 use crate::refine::{JointModel, JointObservations, refine_jointly};
 use crate::types::DOUBTFUL;
 use crate::underfoot::{Ground, Underfoot};
@@ -29,6 +30,10 @@ struct SinglePose {
     inliers: Vec<SceneMatch>,
     /// Median distance to the inliers' scene points.
     depth: f64,
+    /// What the inliers' residuals have in common, if that is more than noise and scenes' own errors.
+    misfit: Option<Misfit>,
+    /// Whether it clearly shows another camera than it is told.
+    is_contradicted: bool,
     evidence: Evidence,
 }
 
@@ -89,6 +94,14 @@ pub(crate) fn locate_with_nearest(
         verdict,
         judge_precision(&params.verdict, found.covariance.as_ref(), found.depth, &mut reasons),
     );
+    if found.is_contradicted {
+        reasons.push("other intrinsics than it is told explain its matches clearly better".to_owned());
+        verdict = weaker(verdict, Verdict::Uncertain);
+    }
+    if let Some(misfit) = &found.misfit {
+        reasons.push(misfit.to_string());
+        verdict = weaker(verdict, Verdict::Uncertain);
+    }
     if scene.is_doubtful(found.inliers.iter().map(|seen| seen.point)) {
         reasons.push(DOUBTFUL.to_owned());
         verdict = weaker(verdict, Verdict::Uncertain);
@@ -114,7 +127,7 @@ fn solve(
     matches: &[SceneMatch],
     seed: u64,
 ) -> Option<SinglePose> {
-    let Fit { mut model, agreeing, .. } =
+    let Fit { mut model, agreeing, is_contradicted, .. } =
         Sought { params, scene, ground, photo, matches, seed }.fit(nearest)?;
     let (camera, pose) = (model.camera_of(0).clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
@@ -146,6 +159,8 @@ fn solve(
             covariance: None,
             inliers: agreeing,
             depth,
+            misfit: None,
+            is_contradicted,
             evidence,
         });
     }
@@ -174,7 +189,17 @@ fn solve(
             evidence.off_ground = evidence.off_ground.max(found);
         }
     }
-    Some(SinglePose { camera, world_from_camera: pose, covariance, inliers, depth, evidence })
+    let misfit = Misfit::of(&rays, scene.index, &pose, &inliers).filter(Misfit::is_clear);
+    Some(SinglePose {
+        camera,
+        world_from_camera: pose,
+        covariance,
+        inliers,
+        depth,
+        misfit,
+        is_contradicted,
+        evidence,
+    })
 }
 
 /// Refines the one photo of `model` on the matches that agree with it, twice, so that new inliers join.
@@ -337,6 +362,25 @@ mod tests {
         assert!((found.camera.params[0] / 800.0 - 1.0).abs() < 0.01, "{:?}", found.camera.params);
         let (center, rotation) = world.errors(0, &found.world_from_camera.unwrap());
         assert!(center < 0.1 && rotation < 0.2, "{center} {rotation}");
+    }
+
+    #[test]
+    fn a_focal_length_that_is_told_wrong_is_found_and_the_right_one_stays() {
+        for (seed, factor) in [(11, 1.0), (11, 0.97), (12, 1.1), (13, 0.9)] {
+            let world = World::chain(2, 0.2, seed);
+            let told = world.camera.with_focal_times(factor);
+            let query = QueryPhoto { camera: &told, calibration: Calibration::Known, ..world.queries()[0] };
+            let locate =
+                |params: &SingleParams| locate_single(params, &world.scene(), &query, 5).answer.photo;
+            let found = locate(&SingleParams::default());
+            assert_eq!(found.verdict, Verdict::Localized, "{found:#?}");
+            assert_eq!(found.camera == told, factor == 1.0, "{factor} {:?}", found.camera.params);
+            assert!((found.camera.params[0] / 800.0 - 1.0).abs() < 0.01, "{:?}", found.camera.params);
+            let (center, rotation) = world.errors(0, &found.world_from_camera.unwrap());
+            assert!(center < 0.1 && rotation < 0.2, "{factor}: {center} {rotation}");
+            let kept = locate(&SingleParams { check_intrinsics: false, ..SingleParams::default() });
+            assert!(kept.camera == told, "{kept:#?}");
+        }
     }
 
     #[test]

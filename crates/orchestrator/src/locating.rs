@@ -1,6 +1,6 @@
 //! Locates photos in a scene: alone, as a set, or as a set when alone fails; and lets the scene grow by them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use anyhow::Result;
@@ -115,8 +115,14 @@ pub fn locate(
     let (skipped, warnings) = (folder.skipped.clone(), folder.warnings.clone());
     let mut located = Located { skipped, warnings, ..Located::default() };
     let mut whole = RunResult::default();
-    if matches!(mode, Mode::Auto | Mode::Single) {
+    if mode != Mode::Set {
         whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);
+        if let Some(shown) = shown_otherwise(&folder.images, &located.single) {
+            let own = std::mem::take(&mut located.single);
+            shown.use_in(folder, &mut located);
+            whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);
+            keep_own(&mut located.single, own, &shown);
+        }
     }
     let found =
         located.single.iter().any(|photo| photo.name == target && photo.verdict == Verdict::Localized);
@@ -128,10 +134,6 @@ pub fn locate(
             whole.absorb(before);
             let (mut guessed, params) = (folder.images.clone(), (&photos, &what.config));
             whole.absorb(guess_by_turns(session, name, &mut guessed, &alike, params, what.seed)?);
-            let is_told = guessed.iter().zip(&folder.images).any(|(told, given)| told.camera != given.camera);
-            if is_told && mode == Mode::Both {
-                whole.absorb(run(session, folder, what, (name, target), (true, false), &mut located)?);
-            }
             folder.images = guessed;
         }
         let lone: Vec<bool> =
@@ -146,8 +148,21 @@ pub fn locate(
                 located.single.clear();
             }
         }
-        let alone = mode == Mode::Both && located.single.is_empty();
-        whole.absorb(run(session, folder, what, (name, target), (alone, true), &mut located)?);
+        whole.absorb(run(session, folder, what, (name, target), (false, true), &mut located)?);
+        let of_set = located.set.iter().flat_map(|set| &set.refined);
+        let shown = shown_otherwise(&folder.images, of_set.clone());
+        if let Some(shown) =
+            shown.filter(|_| !of_set.clone().all(|photo| photo.verdict == Verdict::Localized))
+        {
+            let mut corrected = folder.clone();
+            let mut again = Located { single: Vec::new(), ..located.clone() };
+            shown.use_in(&mut corrected, &mut again);
+            let alone = mode != Mode::Set;
+            whole.absorb(run(session, &corrected, what, (name, target), (alone, true), &mut again)?);
+            if again.verdicts() >= located.verdicts() {
+                (located, *folder) = (again, corrected);
+            }
+        }
         let doubtful = doubtful_guesses(&folder.images, &located, target);
         if doubtful.contains(&true) {
             let mut improved = folder.clone();
@@ -186,6 +201,104 @@ fn correct_told(images: &mut [SourceImage], corrections: &[CorrectedCamera]) -> 
         }
     }
     corrected
+}
+
+/// Focal lengths that photos show in place of those that they are told.
+struct ShownCameras {
+    /// All photos, those that are told such with what is shown.
+    images: Vec<SourceImage>,
+    /// The photos that show them.
+    witnesses: BTreeSet<String>,
+    /// One sentence for each camera.
+    said: Vec<String>,
+}
+
+impl ShownCameras {
+    fn use_in(&self, folder: &mut ImageFolder, located: &mut Located) {
+        folder.images.clone_from(&self.images);
+        folder.warnings.extend_from_slice(&self.said);
+        located.warnings.extend_from_slice(&self.said);
+    }
+}
+
+/// Matches of the photos that show another focal length than they are told, from which on it is used for others, too.
+const TELLING_MATCHES: usize = 100;
+
+/// The focal lengths that localized photos show otherwise than they are told, where these have more than half of the matches of all that
+/// are localized of their camera. `None` where there are none.
+///
+/// A photo that looks at one wall fits any focal length, at another distance; what others of its camera show holds for it, too. Of
+/// several the one of the middle focal length is used, each weighted by its matches.
+fn shown_otherwise<'a>(
+    images: &[SourceImage],
+    answers: impl IntoIterator<Item = &'a PhotoLocalization>,
+) -> Option<ShownCameras> {
+    let answers: BTreeMap<&str, &PhotoLocalization> =
+        answers.into_iter().map(|photo| (&*photo.name, photo)).collect();
+    let mut shown = ShownCameras { images: images.to_vec(), witnesses: BTreeSet::new(), said: Vec::new() };
+    let known = || images.iter().filter(|image| image.calibration == Calibration::Known);
+    let mut asked: Vec<&Camera> = Vec::new();
+    for told in known().map(|image| &image.camera) {
+        if asked.contains(&told) {
+            continue;
+        }
+        asked.push(told);
+        let photos: Vec<&SourceImage> = known().filter(|image| image.camera == *told).collect();
+        let answers = photos.iter().filter_map(|image| answers.get(&*image.name).copied());
+        let placed: Vec<&PhotoLocalization> =
+            answers.filter(|photo| photo.verdict == Verdict::Localized).collect();
+        let witnesses: Vec<&PhotoLocalization> =
+            placed.iter().copied().filter(|photo| photo.camera != *told).collect();
+        let Some(middle) = middle_of(&witnesses) else { continue };
+        let matches = |photos: &[&PhotoLocalization]| photos.iter().map(|photo| photo.inliers).sum::<usize>();
+        if matches(&witnesses) < TELLING_MATCHES || 2 * matches(&witnesses) <= matches(&placed) {
+            continue;
+        }
+        let names: Vec<&str> = photos.iter().map(|image| image.name.as_str()).collect();
+        shown.said.push(said_of_shown(told, &middle.camera, &names, &witnesses));
+        shown.witnesses.extend(witnesses.iter().map(|photo| photo.name.clone()));
+        for image in &mut shown.images {
+            if image.calibration == Calibration::Known && image.camera == *told {
+                image.camera.clone_from(&middle.camera);
+            }
+        }
+    }
+    (!shown.said.is_empty()).then_some(shown)
+}
+
+/// The photo of the middle focal length, each weighted by its matches.
+fn middle_of<'a>(photos: &[&'a PhotoLocalization]) -> Option<&'a PhotoLocalization> {
+    let mut sorted = photos.to_vec();
+    sorted.sort_by(|a, b| a.camera.focal_length().total_cmp(&b.camera.focal_length()));
+    let half = sorted.iter().map(|photo| photo.inliers).sum::<usize>() / 2;
+    let mut seen = 0;
+    sorted.into_iter().find(|photo| {
+        seen += photo.inliers;
+        seen > half
+    })
+}
+
+fn said_of_shown(told: &Camera, shown: &Camera, names: &[&str], witnesses: &[&PhotoLocalization]) -> String {
+    let [told_px, shown_px] = [told, shown].map(Camera::focal_length);
+    let change = format!("{shown_px:.1} px ({:+.1} %)", 100.0 * (shown_px / told_px - 1.0));
+    let names = listed(names, MOST_NAMED);
+    let verb = if witnesses.len() == 1 { "shows" } else { "show" };
+    let witnesses: Vec<&str> = witnesses.iter().map(|photo| photo.name.as_str()).collect();
+    let witnesses = listed(&witnesses, MOST_NAMED);
+    format!(
+        "the focal length that is told for {names} is {told_px:.1} px; {witnesses} {verb} {change}, which is used"
+    )
+}
+
+/// Photos that showed their focal length keep their own answers, which state how well they show it.
+fn keep_own(answers: &mut [PhotoLocalization], own: Vec<PhotoLocalization>, shown: &ShownCameras) {
+    let mut own: BTreeMap<String, PhotoLocalization> =
+        own.into_iter().map(|photo| (photo.name.clone(), photo)).collect();
+    for answer in answers.iter_mut().filter(|answer| shown.witnesses.contains(&answer.name)) {
+        if let Some(own) = own.remove(&answer.name) {
+            *answer = own;
+        }
+    }
 }
 
 fn said_of_corrected(names: &[String]) -> Option<String> {
@@ -434,6 +547,48 @@ pub fn grow(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn focal_lengths_that_most_matches_show_otherwise_hold_for_all_photos_of_the_camera() {
+        let told = Camera::from_focal_guess(1600, 1200, 1000.0);
+        let other = Camera::from_focal_guess(1600, 1200, 1111.0);
+        let image = |name: &str, camera: &Camera| SourceImage {
+            calibration: Calibration::Known,
+            ..SourceImage::guessed(name, camera.clone())
+        };
+        let images =
+            [image("a", &told), image("b", &told), image("c", &told), image("d", &told), image("k", &other)];
+        let answer = |name: &str, focal: f64, inliers, verdict| PhotoLocalization {
+            name: name.to_owned(),
+            camera: Camera::from_focal_guess(1600, 1200, focal),
+            component: 0,
+            world_from_camera: None,
+            covariance: None,
+            inliers,
+            verdict,
+            reasons: Vec::new(),
+        };
+        let answers = |of_b: usize| {
+            [
+                answer("a", 1030.0, 200, Verdict::Localized),
+                answer("b", 1000.0, of_b, Verdict::Localized),
+                answer("c", 1040.0, 50, Verdict::Localized),
+                answer("d", 700.0, 900, Verdict::Uncertain),
+                answer("k", 1111.0, 100, Verdict::Localized),
+            ]
+        };
+        let shown = shown_otherwise(&images, &answers(240)).expect("most matches show another one");
+        let focals = shown.images.iter().map(|image| image.camera.focal_length()).collect::<Vec<f64>>();
+        assert_eq!(focals, [1030.0, 1030.0, 1030.0, 1030.0, 1111.0]);
+        assert_eq!(shown.witnesses.iter().collect::<Vec<_>>(), ["a", "c"]);
+        let said = "the focal length that is told for a, b, c, d is 1000.0 px; a, c show 1030.0 px (+3.0 %), which is used";
+        assert_eq!(shown.said, [said]);
+        assert!(shown_otherwise(&images, &answers(260)).is_none());
+        let mut again = answers(240).to_vec();
+        keep_own(&mut again, vec![answer("a", 1031.0, 1, Verdict::Localized)], &shown);
+        assert_eq!(again[0].camera.focal_length(), 1031.0);
+        assert_eq!(again[2].camera.focal_length(), 1040.0);
+    }
 
     #[test]
     fn guessed_cameras_become_those_that_most_of_the_scene_tells() {

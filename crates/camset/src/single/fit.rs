@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::Vector2;
-use setloc_features::{Camera, CameraModel};
+use setloc_features::{Calibration, Camera, CameraModel};
 use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::robust::{RansacParams, estimate_absolute_pose_focal};
 use setloc_sfm::{ImageId, Rigid};
@@ -29,6 +29,21 @@ const TELLING: usize = 200;
 const MAX_FOCAL_SAMPLES: u32 = 2000;
 /// Least and largest factor on it that P4Pf may find.
 const FOCAL_RANGE: (f64, f64) = (0.4, 2.5);
+
+/// Least that intrinsics which were not told spare of the cost, in squared standard deviations by two, and as a share, to be used. With
+/// the true focal length told others spare up to 8, in rendered scenes, with one that is 3 % wrong 30 to 800 where the photo shows it at all.
+const LEAST_SPARED: f64 = 10.0;
+const LEAST_SPARED_SHARE: f64 = 0.05;
+
+/// Share of the cost that other intrinsics spare from which on nobody knows the camera.
+const CONTRADICTED_SHARE: f64 = 0.25;
+/// How many times too long or short a focal length has to be told for another one to be used where panoramas are stitched: photos among
+/// these are stretched by up to a percent.
+const STRETCHED_CHANGE: f64 = 1.02;
+/// Factors on one that is told.
+const TOLD_FACTORS: [f64; 3] = [1.0, 0.84, 1.19];
+/// How many times too long or short a focal length may be told for another one to be used.
+const MAX_TOLD_ERROR: f64 = 1.35;
 
 /// How many times better a fisheye has to explain the matches than a lens without: it has two more terms, and a
 /// few matches more or less agree with any.
@@ -57,6 +72,8 @@ pub(super) struct Fit {
     pub model: JointModel,
     /// The matches that agree.
     pub agreeing: Vec<SceneMatch>,
+    /// Whether another camera than the one that is told explains clearly more.
+    pub is_contradicted: bool,
     score: f64,
 }
 
@@ -66,7 +83,7 @@ impl Sought<'_> {
         if self.photo.calibration.is_settled() {
             let camera = std::slice::from_ref(self.photo.camera);
             let only = self.hypotheses(camera, self.seed).into_iter().next()?;
-            return Some(self.fitted(only, KnownOfCamera::Intrinsics));
+            return Some(self.as_told(nearest, self.fitted(only, KnownOfCamera::Intrinsics)));
         }
         Some(self.at_best_focal(nearest, self.of_any_lens()?))
     }
@@ -91,17 +108,22 @@ impl Sought<'_> {
 
     /// The same without fisheyes.
     fn of_usual_lens(&self) -> Option<Fit> {
-        let likely = FOCAL_FACTORS.map(|factor| self.photo.camera.with_focal_times(factor));
-        let mut likely = self.hypotheses(&likely, self.seed);
-        likely.truncate(MOST_FITTED);
-        likely.extend(self.by_focal_length(self.seed ^ 0xf0ca));
         // Few matches fit with distortion that no lens has, at a wrong distance, if that is free before the pose is about right.
-        let without = likely.into_iter().map(|found| self.fitted(found, KnownOfCamera::Distortion));
-        let without = best_of(without)?;
+        let without = self.of_free_focal(&FOCAL_FACTORS)?;
         let with = self.fitted(without.hypothesis(), KnownOfCamera::Usual);
         let mut best = if with.score > without.score { with } else { without };
         best.model.cameras[0].known = KnownOfCamera::Usual;
         Some(best)
+    }
+
+    /// Camera and pose where of the intrinsics the focal length is free, in turn so many times what is told or guessed.
+    fn of_free_focal(&self, factors: &[f64]) -> Option<Fit> {
+        let likely: Vec<Camera> =
+            factors.iter().map(|&factor| self.photo.camera.with_focal_times(factor)).collect();
+        let mut likely = self.hypotheses(&likely, self.seed);
+        likely.truncate(MOST_FITTED);
+        likely.extend(self.by_focal_length(self.seed ^ 0xf0ca));
+        best_of(likely.into_iter().map(|found| self.fitted(found, KnownOfCamera::Distortion)))
     }
 
     /// The pose, and of the camera what is not known, fitted to the matches that agree until no more do.
@@ -122,10 +144,62 @@ impl Sought<'_> {
             let pose = model.photos[0].world_from_camera;
             let agreeing = inliers(&rays, scene.index, &pose, matches, params.max_error_sigmas);
             if model.cameras[0].is_known() || agreeing.len() <= most {
-                return Fit { agreeing, score: self.score(&rays, &pose), model };
+                return Fit { agreeing, is_contradicted: false, score: self.score(&rays, &pose), model };
             }
             most = agreeing.len();
         }
+    }
+
+    /// The fit with the camera that is told, or with another focal length where that explains clearly more.
+    ///
+    /// At a wrong focal length the pose is as far off as it makes the scene nearer or farther, with matches of its own that agree
+    /// with it: no small step leads out of it, so the focal length is sought as if nothing were known of it. Of what agrees with any
+    /// fit all poses are refined on all, and what these leave is compared. Where other distortion and another principal point explain
+    /// clearly more again, or a focal length far from what is told, nobody knows the camera.
+    fn as_told(&self, nearest: &[NearestPoints], told: Fit) -> Fit {
+        let is_asked = self.params.check_intrinsics
+            && self.photo.calibration == Calibration::Known
+            && !self.photo.camera.is_panoramic();
+        let is_telling = |fit: &Fit| fit.agreeing.len() >= self.params.verdict.min_inliers;
+        if !is_asked || !is_telling(&told) {
+            return told;
+        }
+        let Some(of_focal) = self.of_free_focal(&TOLD_FACTORS).map(|fit| self.at_best_focal(nearest, fit))
+        else {
+            return told;
+        };
+        let of_usual = self.fitted(of_focal.hypothesis(), KnownOfCamera::Usual);
+        let shown = [&told, &of_focal, &of_usual].map(|fit| self.shown_by(nearest, fit));
+        let seen = union(&union(&shown[0], &shown[1]), &shown[2]);
+        let [by_told, by_focal, by_usual] = [&told, &of_focal, &of_usual].map(|fit| self.cost_on(fit, &seen));
+        let is_clear = |than: f64, cost: f64| than - cost > LEAST_SPARED.max(LEAST_SPARED_SHARE * than);
+        let ratio = of_focal.model.camera_of(0).focal_length() / self.photo.camera.focal_length();
+        let is_stretched = told.model.stretch.is_likely;
+        let least_change = if is_stretched { STRETCHED_CHANGE } else { 1.0 };
+        let is_of_lens = (least_change.ln()..=MAX_TOLD_ERROR.ln()).contains(&ratio.ln().abs());
+        let is_other = is_telling(&of_focal) && is_of_lens && is_clear(by_told, by_focal);
+        let (least, mut best) = if is_other { (by_focal, of_focal) } else { (by_told, told) };
+        best.is_contradicted = !is_stretched && least - by_focal.min(by_usual) > CONTRADICTED_SHARE * least;
+        best
+    }
+
+    /// What agrees with a fit, guided matches among it.
+    fn shown_by(&self, nearest: &[NearestPoints], fit: &Fit) -> Vec<SceneMatch> {
+        let Self { params, scene, photo, .. } = *self;
+        let (pose, rays) = (fit.pose(), PhotoRays::new(photo.features, fit.model.camera_of(0)));
+        let guided = guided_matches(&params.guided, scene.index, &rays, nearest, &pose);
+        inliers(&rays, scene.index, &pose, &union(&fit.agreeing, &guided), params.max_error_sigmas)
+    }
+
+    /// Σ min(e, T)² / 2 over matches that a fit is refined on.
+    fn cost_on(&self, fit: &Fit, matches: &[SceneMatch]) -> f64 {
+        let Self { params, scene, photo, .. } = *self;
+        let mut model = fit.model.clone();
+        refine(&mut model, scene, photo, matches, params.max_error_sigmas, false);
+        let rays = PhotoRays::new(photo.features, model.camera_of(0));
+        let pose = model.photos[0].world_from_camera;
+        let error = |&m: &SceneMatch| rays.error_sigmas(scene.index, &pose, m).min(params.max_error_sigmas);
+        matches.iter().map(|m| error(m).powi(2) / 2.0).sum()
     }
 
     /// The fit at the focal length nearby at which guided matching shows most of the scene.
@@ -133,12 +207,7 @@ impl Sought<'_> {
     /// What is far or flat fits a longer focal length and a step back about as well, and a few matches may agree better with
     /// those; but then fewer are found beside them.
     fn at_best_focal(&self, nearest: &[NearestPoints], first: Fit) -> Fit {
-        let Self { params, scene, photo, seed, .. } = *self;
-        let shown = |fit: &Fit| {
-            let (pose, rays) = (fit.pose(), PhotoRays::new(photo.features, fit.model.camera_of(0)));
-            let guided = guided_matches(&params.guided, scene.index, &rays, nearest, &pose);
-            inliers(&rays, scene.index, &pose, &union(&fit.agreeing, &guided), params.max_error_sigmas).len()
-        };
+        let shown = |fit: &Fit| self.shown_by(nearest, fit).len();
         let JointCamera { camera, known } = first.model.cameras[0].clone();
         let (mut most, mut best) = (shown(&first), first);
         if most >= TELLING {
@@ -147,7 +216,7 @@ impl Sought<'_> {
         for step in [1.0 / FOCAL_STEP, FOCAL_STEP] {
             let mut factor = step;
             for _ in 0..MAX_FOCAL_STEPS {
-                let Some(found) = self.hypotheses(&[camera.with_focal_times(factor)], seed).pop() else {
+                let Some(found) = self.hypotheses(&[camera.with_focal_times(factor)], self.seed).pop() else {
                     break;
                 };
                 let other = self.fitted(found, KnownOfCamera::Intrinsics);
@@ -163,7 +232,7 @@ impl Sought<'_> {
         best
     }
 
-    /// For each camera the pose of greatest score, best first: from all matches, and where the intrinsics are known from
+    /// For each camera the pose of greatest score, best first: from all matches, and of one whose intrinsics are known from
     /// covisible parts of them, too.
     fn hypotheses(&self, cameras: &[Camera], seed: u64) -> Vec<Hypothesis> {
         let Self { params, scene, ground, photo, matches, .. } = *self;

@@ -1,11 +1,14 @@
 //! What a component's poses come to: an answer for each photo.
 
+use std::collections::BTreeMap;
+
 use nalgebra::Vector3;
 use setloc_features::Calibration;
 use setloc_sfm::{ImageId, Rigid};
 
 use super::{Component, Joint};
-use crate::evidence::{median, same_pose};
+use crate::evidence::{PhotoRays, median, same_pose};
+use crate::misfit::Misfit;
 use crate::refine::JointPhoto;
 use crate::set::correspondences::SetCorrespondence;
 use crate::set::rigid::RigidPose;
@@ -75,6 +78,7 @@ impl Component<'_> {
         });
         let supporting = rigid.agreeing.len() + rigid.sights.len() + rigid.lone.len();
         let kept = (kept.count() + joint.kept_sights) as f64 / supporting.max(1) as f64;
+        let misfits = self.misfits(joint);
         (0..self.members.len())
             .map(|slot| {
                 let photo = self.members[slot];
@@ -127,6 +131,10 @@ impl Component<'_> {
                         }
                     }
                 }
+                if let Some((misfit, of)) = misfits.get(&joint.model.photos[slot].camera) {
+                    reasons.push(format!("of its camera {of}: {misfit}"));
+                    verdict = weaker(verdict, Verdict::Uncertain);
+                }
                 let of_standpoint =
                     |to: usize| joint.model.photos[to].standpoint == joint.model.photos[slot].standpoint;
                 let lengths = self.lengths().filter(|&([.., to], _)| of_standpoint(to));
@@ -145,6 +153,26 @@ impl Component<'_> {
                 (answer, is_elsewhere)
             })
             .unzip()
+    }
+
+    /// By camera, what residuals of the photo with most matches have in common, and its name, if that is more than noise and errors
+    /// of a scene.
+    fn misfits(&self, joint: &Joint) -> BTreeMap<usize, (Misfit, &str)> {
+        let mut most: BTreeMap<usize, usize> = BTreeMap::new();
+        for (slot, photo) in joint.model.photos.iter().enumerate() {
+            let of_camera = most.entry(photo.camera).or_insert(slot);
+            if joint.direct[slot].len() > joint.direct[*of_camera].len() {
+                *of_camera = slot;
+            }
+        }
+        let misfit = |(camera, slot): (usize, usize)| {
+            let photo = &self.photos[self.members[slot]];
+            let rays = PhotoRays::new(photo.features, joint.model.camera_of(slot));
+            let pose = &joint.model.photos[slot].world_from_camera;
+            let misfit = Misfit::of(&rays, self.scene.index, pose, &joint.direct[slot])?;
+            misfit.is_clear().then_some((camera, (misfit, photo.name)))
+        };
+        most.into_iter().filter_map(misfit).collect()
     }
 
     /// Whether intrinsics are known, shared with another photo of the model or told by its points.
