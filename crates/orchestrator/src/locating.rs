@@ -548,6 +548,20 @@ pub fn grow(
 mod tests {
     use super::*;
 
+    /// An answer of a photo with this focal length and so many matches.
+    fn answer(name: &str, focal: f64, inliers: usize, verdict: Verdict) -> PhotoLocalization {
+        PhotoLocalization {
+            name: name.to_owned(),
+            camera: Camera::from_focal_guess(1600, 1200, focal),
+            component: 0,
+            world_from_camera: None,
+            covariance: None,
+            inliers,
+            verdict,
+            reasons: Vec::new(),
+        }
+    }
+
     #[test]
     fn focal_lengths_that_most_matches_show_otherwise_hold_for_all_photos_of_the_camera() {
         let told = Camera::from_focal_guess(1600, 1200, 1000.0);
@@ -558,16 +572,6 @@ mod tests {
         };
         let images =
             [image("a", &told), image("b", &told), image("c", &told), image("d", &told), image("k", &other)];
-        let answer = |name: &str, focal: f64, inliers, verdict| PhotoLocalization {
-            name: name.to_owned(),
-            camera: Camera::from_focal_guess(1600, 1200, focal),
-            component: 0,
-            world_from_camera: None,
-            covariance: None,
-            inliers,
-            verdict,
-            reasons: Vec::new(),
-        };
         let answers = |of_b: usize| {
             [
                 answer("a", 1030.0, 200, Verdict::Localized),
@@ -603,17 +607,6 @@ mod tests {
         let guessed = |name: &str| image(name, &guess, Calibration::Guessed);
         let images =
             [guessed("a"), guessed("b"), guessed("c"), guessed("d"), image("k", &known, Calibration::Known)];
-        let with_focal = |focal: f64| Camera::from_focal_guess(1600, 1200, focal);
-        let photo = |name: &str, focal: f64, inliers, verdict| PhotoLocalization {
-            name: name.to_owned(),
-            camera: with_focal(focal),
-            component: 0,
-            world_from_camera: None,
-            covariance: None,
-            inliers,
-            verdict,
-            reasons: Vec::new(),
-        };
         let told = |refined: Vec<PhotoLocalization>| {
             let set = SetLocalization { refined, ..SetLocalization::default() };
             let images = with_estimated_cameras(&images, &[], Some(&set))?;
@@ -625,26 +618,26 @@ mod tests {
             Some((images[0].camera.focal_length(), images[0].calibration))
         };
         let by_two = vec![
-            photo("a", 1500.0, 60, Localized),
-            photo("b", 1200.0, 50, Localized),
-            photo("c", 1200.0, 20, Localized),
-            photo("d", 900.0, 500, Uncertain),
+            answer("a", 1500.0, 60, Localized),
+            answer("b", 1200.0, 50, Localized),
+            answer("c", 1200.0, 20, Localized),
+            answer("d", 900.0, 500, Uncertain),
         ];
         let by_three: Vec<_> =
-            by_two.iter().cloned().chain([photo("a", 1200.0, 9, Localized)]).skip(1).collect();
+            by_two.iter().cloned().chain([answer("a", 1200.0, 9, Localized)]).skip(1).collect();
         assert_eq!(told(by_three), Some((1200.0, Calibration::Estimated)));
         // What few photos tell is a guess still.
         assert_eq!(told(by_two), Some((1200.0, Calibration::Guessed)));
-        let uncertain = vec![photo("a", 1500.0, 9, Uncertain), photo("b", 1920.0, 0, NotLocalized)];
+        let uncertain = vec![answer("a", 1500.0, 9, Uncertain), answer("b", 1920.0, 0, NotLocalized)];
         assert_eq!(told(uncertain), Some((1500.0, Calibration::Guessed)));
-        assert_eq!(told(vec![photo("a", 1500.0, 0, NotLocalized)]), None);
-        assert_eq!(told(vec![photo("k", 1111.0, 99, Localized)]), None);
+        assert_eq!(told(vec![answer("a", 1500.0, 0, NotLocalized)]), None);
+        assert_eq!(told(vec![answer("k", 1111.0, 99, Localized)]), None);
         assert!(with_estimated_cameras(&images, &[], None).is_none());
         // Photos that do not share the guess have what each shows.
         let refined = vec![
-            photo("a", 1500.0, 60, Localized),
-            photo("b", 1200.0, 50, Localized),
-            photo("c", 1200.0, 20, Localized),
+            answer("a", 1500.0, 60, Localized),
+            answer("b", 1200.0, 50, Localized),
+            answer("c", 1200.0, 20, Localized),
         ];
         let set = SetLocalization { refined, ..SetLocalization::default() };
         let told = with_estimated_cameras(&images, &[true; 5], Some(&set)).expect("three are told");
