@@ -73,9 +73,9 @@ pub use geodesy::Wgs84;
 pub use grey::GreyImage;
 pub use mask::Mask;
 pub use matching::{
-    DescriptorBlock, Elevations, GuidedParams, Match, MatchParams, Posture, TwoNearest, match_features,
-    match_guided, match_guided_among, match_simulated_views, offer_nearer, squared_distance, squared_norm,
-    two_nearest, without_carried,
+    CarriedCells, ComparedPhoto, DescriptorBlock, Elevations, GuidedParams, Match, MatchParams, Posture,
+    TwoNearest, match_features, match_guided, match_guided_among, match_simulated_views, offer_nearer,
+    squared_distance, squared_norm, two_nearest, without_carried, without_carried_cells,
 };
 pub use nearby::NearbyKeypoints;
 pub use patch::{Aligned, ImagePyramid, Patch, PatchFrame, PatchParams, Template};

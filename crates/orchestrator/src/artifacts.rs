@@ -1,13 +1,16 @@
 //! What the jobs hand on, as files.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 use setloc_camset::{AnywhereLocalization, Growth, NearestAnywhere, SetLocalization};
-use setloc_features::{ImageFeatures, Keypoint, Match, SimulatedView};
+use setloc_features::{CarriedCells, ImageFeatures, Keypoint, Match, SimulatedView};
 use setloc_index::SceneIndex;
 use setloc_sfm::robust::TurnedCamera;
 use setloc_sfm::{MapperOutput, TwoView};
 
 use crate::codec::{Artifact, CodecError};
+use crate::fingerprint::ContentHash;
 use crate::serde_artifact;
 
 /// Features as raw blocks behind a short head: a gigabyte of descriptors is copied, not parsed.
@@ -110,6 +113,11 @@ pub struct VerifiedPair(pub Vec<TwoView>);
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct TurnedPair(pub Option<TurnedCamera>);
 
+/// Which parts of photos show what moves with their camera, by the content of the photo; photos without such parts are not in it, so that
+/// a photo more changes nothing.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct CarriedParts(pub BTreeMap<ContentHash, CarriedCells>);
+
 /// For each image others that look alike, most first; empty for images that nobody asked about.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct LikelyImages(pub Vec<Vec<u32>>);
@@ -141,6 +149,7 @@ impl LeftApart {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SceneIndices(pub Vec<SceneIndex>);
 
+serde_artifact!(CarriedParts, "carried parts", 1);
 serde_artifact!(LikelyImages, "likely images", 1);
 serde_artifact!(LeftApart, "images left apart", 1);
 serde_artifact!(VerifiedPair, "verified pair", 1);

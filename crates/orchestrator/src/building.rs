@@ -14,7 +14,9 @@ use crate::dataset::{ImageFolder, SkippedImage, SourceImage, with_told_cameras};
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
 use crate::graph::{Executor, JobGraph, RunResult};
-use crate::jobs::{ApartJob, LikelyJobs, SceneInputs, SceneJobs, SceneModelJobs, add_first_model, add_scene};
+use crate::jobs::{
+    ApartJob, LikelyJobs, SceneInputs, SceneJobs, SceneModelJobs, add_first_model, add_scene, said_of_carried,
+};
 use crate::scene::SceneFile;
 use crate::session::Session;
 use crate::stages::FeatureParams;
@@ -341,7 +343,8 @@ fn outcome_of(
             run.failed.iter().map(|(job, reason)| format!("{job}: {reason}")).collect();
         anyhow::bail!("the scene could not be made: {}", reasons.join("; "));
     };
-    let warnings: Vec<String> = masked_out(executor, folder, jobs)?.into_iter().collect();
+    let carried = said_of_carried(executor, &jobs.carried, &folder.images)?;
+    let warnings: Vec<String> = masked_out(executor, folder, jobs)?.into_iter().chain(carried).collect();
     if present == Some(hash) {
         return Ok(BuildOutcome::Unchanged(run.clone(), skipped, warnings));
     }

@@ -2,6 +2,7 @@
 
 mod accuracy;
 mod alignment;
+mod carried;
 mod features;
 mod grow;
 mod likely;
@@ -15,7 +16,8 @@ mod positions;
 mod scene;
 mod scene_file;
 
-pub use features::{add_features_of, features_role};
+pub use carried::said_of_carried;
+pub use features::{Looks, add_features_of, features_role};
 pub use grow::{GROWN_KIND, LocatedJobs, SCENE_INPUT, add_grown};
 pub use likely::LikelyJobs;
 pub use locate::{LocateJobs, SetJobs, SingleJobs, add_set, add_singles};

@@ -15,6 +15,7 @@ use crate::fingerprint::ContentHash;
 use crate::graph::{JobGraph, RunResult};
 use crate::jobs::{
     LocateJobs, LocatedJobs, SceneInputs, add_features_of, add_grown, add_set, add_singles, divided_guesses,
+    said_of_carried,
 };
 use crate::scene::SceneFile;
 use crate::session::Session;
@@ -50,6 +51,8 @@ pub struct Located {
     pub warnings: Vec<String>,
     /// Which photos were given one camera with others that, by the local model, seem not to have the same.
     pub divided: Vec<bool>,
+    /// What was found to move with the cameras of the set's photos.
+    pub carried: Option<String>,
 }
 
 impl Located {
@@ -187,6 +190,8 @@ pub fn locate(
             }
         }
     }
+    folder.warnings.extend(located.carried.clone());
+    located.warnings.extend(located.carried.clone());
     session.remember(name, &whole);
     Ok(located)
 }
@@ -449,6 +454,7 @@ fn run(
             let model = executor.load::<MapperOutput>(set.model.model)?;
             located.local_models = model.components.iter().map(|c| c.registered().count()).collect();
             located.divided = divided_guesses(&folder.images, &model);
+            located.carried = said_of_carried(executor, &set.model.carried, &folder.images)?;
         }
         Ok(before.and(result.clone()))
     })

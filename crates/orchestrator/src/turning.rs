@@ -12,7 +12,7 @@ use crate::artifacts::TurnedPair;
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, SourceImage};
 use crate::graph::{JobGraph, JobId, RunResult};
-use crate::jobs::{PairSource, add_features_of, add_turned, choose_pairs};
+use crate::jobs::{Looks, PairSource, add_turned, choose_pairs};
 use crate::session::Session;
 use crate::stages::FeatureParams;
 use crate::text::some_of;
@@ -43,9 +43,9 @@ impl TurnedJobs<'_> {
             return None;
         }
         let mut graph = JobGraph::default();
-        let features = add_features_of(&mut graph, images, features);
+        let looks = Looks::once(&mut graph, images, features);
         let add = |pair: (usize, usize)| {
-            let job = add_turned(&mut graph, PairSource { images, config, seed }, &features, pair);
+            let job = add_turned(&mut graph, PairSource { images, config, seed }, &looks, pair);
             graph.want(job);
             (pair, job)
         };

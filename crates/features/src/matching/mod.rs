@@ -4,6 +4,7 @@ mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 mod carried;
+mod carried_cells;
 mod guided;
 mod kernel;
 #[cfg(target_arch = "x86_64")]
@@ -16,6 +17,7 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 
 use crate::{Camera, DESCRIPTOR_LEN, DESCRIPTOR_NORM, FeatureError, ImageFeatures, Keypoint};
+pub use carried_cells::{CarriedCells, ComparedPhoto, without_carried_cells};
 pub use guided::{GuidedParams, match_guided, match_guided_among};
 pub use kernel::{DescriptorBlock, TwoNearest, offer_nearer, squared_distance, squared_norm, two_nearest};
 

@@ -1,12 +1,13 @@
 //! Features of images: of scenes, which may look at some of them twice, and of photos.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use anyhow::{Context, Result};
 use serde_json::json;
 use setloc_features::{Camera, ImageFeatures};
 
+use super::carried::add_carried;
 use crate::config::Config;
 use crate::dataset::SourceImage;
 use crate::fingerprint::ContentHash;
@@ -14,22 +15,27 @@ use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
 use crate::stages;
 
 /// The features jobs of some images.
-pub(super) struct Looks {
+pub struct Looks {
     /// Without the views that a second look simulates.
     pub first: Vec<JobId>,
     /// With them, where there is one; else the same.
     pub last: Vec<JobId>,
+    /// What tells of each photo what moves with its camera.
+    carried: Vec<Option<JobId>>,
 }
 
 impl Looks {
-    pub fn once(features: Vec<JobId>) -> Self {
-        Self { first: features.clone(), last: features }
+    /// Adds decoding and extraction of each image.
+    pub fn once(graph: &mut JobGraph<'_>, images: &[SourceImage], params: &stages::FeatureParams) -> Self {
+        let features = add_features_of(graph, images, params);
+        let carried = add_carried(graph, images, &features);
+        Self { first: features.clone(), last: features, carried }
     }
 
     /// Adds decoding and extraction of the images of a scene, and what a second look adds to those that are due one.
-    pub fn add(graph: &mut JobGraph<'_>, images: &[SourceImage], config: &Config) -> Self {
+    pub(super) fn add(graph: &mut JobGraph<'_>, images: &[SourceImage], config: &Config) -> Self {
         let second = config.second_features();
-        let mut looks = Self::once(add_features_of(graph, images, &config.features));
+        let mut looks = Self::once(graph, images, &config.features);
         for (image, last) in images.iter().zip(&mut looks.last).filter(|(image, _)| image.second_look) {
             // Views that the first look has simulated are not those of the second.
             let beside = (config.features.simulated_tilt <= 1.0).then_some(*last);
@@ -38,8 +44,19 @@ impl Looks {
         looks
     }
 
-    pub fn is_again(&self, at: usize) -> bool {
+    pub(super) fn is_again(&self, at: usize) -> bool {
         self.first[at] != self.last[at]
+    }
+
+    /// The jobs that tell what moves with the cameras of photos.
+    pub(super) fn all_carried(&self) -> Vec<JobId> {
+        let jobs: BTreeSet<JobId> = self.carried.iter().copied().flatten().collect();
+        jobs.into_iter().collect()
+    }
+
+    /// The job that tells what moves with the cameras of two photos of a size.
+    pub(super) fn carried_by(&self, (a, b): (usize, usize)) -> Option<JobId> {
+        self.carried[a].filter(|_| self.carried[a] == self.carried[b])
     }
 }
 

@@ -1,16 +1,18 @@
 //! Which images look alike: pairs for large unordered sets whose places nobody measured.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use anyhow::Result;
 use rayon::prelude::*;
 use serde_json::json;
-use setloc_features::{Camera, ImageFeatures, without_carried};
+use setloc_features::{Camera, CarriedCells, ImageFeatures, without_carried, without_carried_cells};
 
+use super::carried::add_carried;
 use super::features::{add_features_of, features_role};
-use crate::artifacts::LikelyImages;
+use crate::artifacts::{CarriedParts, LikelyImages};
 use crate::config::Config;
 use crate::dataset::SourceImage;
+use crate::fingerprint::ContentHash;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
 use crate::stages::{self, MatchParams};
 
@@ -56,16 +58,30 @@ impl LikelyJobs {
         let ordered: Vec<SourceImage> = order.iter().map(|&at| images[at].clone()).collect();
         let wanted: Vec<bool> = ordered.iter().map(is_wanted).collect();
         let features = add_features_of(graph, &ordered, features);
+        let carried: BTreeSet<JobId> =
+            add_carried(graph, &ordered, &features).into_iter().flatten().collect();
+        let sizes = carried.len();
         let cameras: Vec<Camera> = ordered.iter().map(|image| image.camera.clone()).collect();
         let matching = config.matching.clone();
-        let params = json!({ "cameras": cameras, "matching": matching, "strongest": STRONGEST, "alike": most, "wanted": wanted });
+        let hashes: Vec<ContentHash> = ordered.iter().map(|image| image.hash).collect();
+        let params = json!({
+            "images": hashes, "cameras": cameras, "matching": matching, "strongest": STRONGEST, "alike": most,
+            "wanted": wanted,
+        });
         let work = move |inputs: &Inputs<'_, '_>| {
             let strongest = (0..wanted.len()).into_par_iter().with_max_len(1).map(|at| {
                 let features = inputs.find::<ImageFeatures>(&features_role(at))?;
                 Ok(features.map(|features| features.strongest(STRONGEST)).unwrap_or_default())
             });
             let strongest: Vec<ImageFeatures> = strongest.collect::<Result<_>>()?;
-            Product::new(LikelyImages(most_alike(&matching, &strongest, &cameras, &wanted, most)))
+            let mut carried = CarriedParts::default();
+            for size in 0..sizes {
+                carried.0.extend(inputs.get::<CarriedParts>(&carried_role(size))?.0.clone());
+            }
+            let carried: Vec<CarriedCells> =
+                hashes.iter().map(|hash| carried.0.get(hash).cloned().unwrap_or_default()).collect();
+            let images = Compared { features: &strongest, carried: &carried, cameras: &cameras };
+            Product::new(LikelyImages(most_alike(&matching, &images, &wanted, most)))
         };
         let likely = graph.add(Job {
             kind: "likely",
@@ -78,6 +94,9 @@ impl LikelyJobs {
         });
         for (at, &features) in features.iter().enumerate() {
             graph.accept(likely, features_role(at), features);
+        }
+        for (size, job) in carried.into_iter().enumerate() {
+            graph.require(likely, carried_role(size), job);
         }
         graph.want(likely);
         Ok(Some(Self { order, likely }))
@@ -105,16 +124,38 @@ impl LikelyJobs {
     }
 }
 
+/// What tells of the photos of a size what moves with their cameras.
+fn carried_role(size: usize) -> String {
+    format!("carried {size:04}")
+}
+
+/// What is compared of images, one of each an image.
+struct Compared<'a> {
+    features: &'a [ImageFeatures],
+    carried: &'a [CarriedCells],
+    cameras: &'a [Camera],
+}
+
+impl Compared<'_> {
+    /// How many matches two of them share.
+    fn shared(&self, matching: &MatchParams, [a, b]: [usize; 2]) -> usize {
+        let [first, second] = [a, b].map(|at| &self.features[at]);
+        let found = stages::match_features(matching, stages::Posture::Any, first, second);
+        let posture = stages::Posture::of([a, b].map(|at| &self.cameras[at]));
+        let found = without_carried(found, posture, first, second);
+        let size = |at: usize| (self.cameras[at].width, self.cameras[at].height);
+        if size(a) == size(b) {
+            without_carried_cells(found, [a, b].map(|at| &self.carried[at]), first, second).len()
+        } else {
+            found.len()
+        }
+    }
+}
+
 /// For each wanted image so many others that share most matches with it, most first.
-fn most_alike(
-    matching: &MatchParams,
-    images: &[ImageFeatures],
-    cameras: &[Camera],
-    wanted: &[bool],
-    most: usize,
-) -> Vec<Vec<u32>> {
+fn most_alike(matching: &MatchParams, images: &Compared<'_>, wanted: &[bool], most: usize) -> Vec<Vec<u32>> {
     let matching = MatchParams { screen_features: 0, ..matching.clone() };
-    let count = images.len();
+    let count = images.features.len();
     // Each pair once.
     let rows: Vec<Vec<u32>> = (0..count)
         .into_par_iter()
@@ -122,14 +163,7 @@ fn most_alike(
         .map(|a| {
             let shared = |b: usize| {
                 let is_asked = wanted[a] || wanted[b];
-                if is_asked {
-                    let posture = stages::Posture::of([&cameras[a], &cameras[b]]);
-                    let (first, second) = (&images[a], &images[b]);
-                    let found = stages::match_features(&matching, stages::Posture::Any, first, second);
-                    without_carried(found, posture, first, second).len() as u32
-                } else {
-                    0
-                }
+                if is_asked { images.shared(&matching, [a, b]) as u32 } else { 0 }
             };
             (a + 1..count).map(shared).collect()
         })
@@ -173,12 +207,13 @@ mod tests {
 
     #[test]
     fn neighbours_look_most_alike_and_only_who_asks_gets_an_answer() {
-        let images = street(6);
-        let cameras = vec![Camera::equirectangular(100, 50); 6];
-        let found = most_alike(&MatchParams::default(), &images, &cameras, &[true; 6], 2);
+        let (features, cameras) = (street(6), vec![Camera::equirectangular(100, 50); 6]);
+        let carried = vec![CarriedCells::default(); 6];
+        let images = Compared { features: &features, carried: &carried, cameras: &cameras };
+        let found = most_alike(&MatchParams::default(), &images, &[true; 6], 2);
         assert_eq!(found, [vec![1], vec![0, 2], vec![1, 3], vec![2, 4], vec![3, 5], vec![4]]);
         let wanted = [false, false, true, false, false, false];
-        let one = most_alike(&MatchParams::default(), &images, &cameras, &wanted, 1);
+        let one = most_alike(&MatchParams::default(), &images, &wanted, 1);
         assert_eq!(one, [vec![], vec![], vec![1], vec![], vec![], vec![]]);
     }
 

@@ -5,15 +5,16 @@ use std::collections::BTreeMap;
 use anyhow::Result;
 use nalgebra::Vector2;
 use serde_json::{Value, json};
-use setloc_features::ImageFeatures;
+use setloc_features::{ImageFeatures, Match, without_carried_cells};
 use setloc_sfm::robust::{RansacParams, estimate_turned_camera};
 use setloc_sfm::verify_pair;
 
 use super::derived_seed;
 use super::features::Looks;
-use crate::artifacts::{PairMatches, TurnedPair, VerifiedPair};
+use crate::artifacts::{CarriedParts, PairMatches, TurnedPair, VerifiedPair};
 use crate::config::Config;
 use crate::dataset::SourceImage;
+use crate::fingerprint::ContentHash;
 use crate::graph::{Inputs, Job, JobGraph, JobId, Product};
 use crate::stages;
 
@@ -47,7 +48,7 @@ pub(super) fn add_pair(
     looks: &Looks,
     (a, b): (usize, usize),
 ) -> PairJobs {
-    let mut matches = add_matches(graph, source, &looks.first, (a, b));
+    let mut matches = add_matches(graph, source, looks, (a, b));
     if looks.is_again(a) || looks.is_again(b) {
         matches = add_matches_of_views(graph, source, looks, (a, b), matches);
     }
@@ -106,23 +107,49 @@ fn add_pair_job<'a>(
     job
 }
 
+/// What tells of two photos what moves with their cameras, to a job that matches them.
+const CARRIED: &str = "carried";
+
+/// The matches of two images, which have these hashes, without those of what moves with their cameras, as far as it is told.
+fn without_told_carried(
+    inputs: &Inputs<'_, '_>,
+    hashes: [ContentHash; 2],
+    matches: Vec<Match>,
+    [first, second]: [&ImageFeatures; 2],
+) -> Result<Vec<Match>> {
+    let Some(told) = inputs.find::<CarriedParts>(CARRIED)? else { return Ok(matches) };
+    let [Some(of_first), Some(of_second)] = hashes.map(|hash| told.0.get(&hash)) else { return Ok(matches) };
+    Ok(without_carried_cells(matches, [of_first, of_second], first, second))
+}
+
 /// Adds matching of one pair.
 fn add_matches(
     graph: &mut JobGraph<'_>,
     PairSource { images, config, .. }: PairSource<'_>,
-    features: &[JobId],
+    looks: &Looks,
     pair: (usize, usize),
 ) -> JobId {
     let (a, b) = in_order(images, pair);
     let matching = config.matching.clone();
     let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
-    let params = json!({ "matching": config.matching, "posture": posture });
+    let hashes = [images[a].hash, images[b].hash];
+    let carried = looks.carried_by(pair);
+    let params = match carried {
+        // Which image is which decides what is carried.
+        Some(_) => json!({ "matching": config.matching, "posture": posture, "images": hashes }),
+        None => json!({ "matching": config.matching, "posture": posture }),
+    };
     let work = move |inputs: &Inputs<'_, '_>| {
         let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
-        Product::new(PairMatches(stages::match_features(&matching, posture, &first, &second)))
+        let found = stages::match_features(&matching, posture, &first, &second);
+        Product::new(PairMatches(without_told_carried(inputs, hashes, found, [&first, &second])?))
     };
     let job = pair_job(images, (a, b), ("matches", stages::MATCHING_VERSION), params, work);
-    add_pair_job(graph, job, features, (a, b))
+    let job = add_pair_job(graph, job, &looks.first, (a, b));
+    if let Some(carried) = carried {
+        graph.require(job, CARRIED, carried);
+    }
+    job
 }
 
 /// Adds to the matches of one pair those of the views that a second look simulates of either.
@@ -136,25 +163,36 @@ fn add_matches_of_views(
     let (a, b) = in_order(images, pair);
     let matching = config.matching.clone();
     let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
-    let params = json!({ "matching": config.matching, "posture": posture, "beside": "own" });
+    let hashes = [images[a].hash, images[b].hash];
+    let carried = looks.carried_by(pair);
+    let params = match carried {
+        Some(_) => {
+            json!({ "matching": config.matching, "posture": posture, "beside": "own", "images": hashes })
+        }
+        None => json!({ "matching": config.matching, "posture": posture, "beside": "own" }),
+    };
     let work = move |inputs: &Inputs<'_, '_>| {
         let features = |role: &str| inputs.get::<ImageFeatures>(role);
         let (first, second) = (features("first")?, features("second")?);
         let had_views =
             !features("first alone")?.simulated.is_empty() || !features("second alone")?.simulated.is_empty();
-        Product::new(PairMatches(if had_views {
+        let found = if had_views {
             // Those of faint images are among what has been matched.
             stages::match_features(&matching, posture, &first, &second)
         } else {
             let own = inputs.get::<PairMatches>("own")?;
             stages::match_simulated_views(&matching, posture, &first, &second, &own.0)
-        }))
+        };
+        Product::new(PairMatches(without_told_carried(inputs, hashes, found, [&first, &second])?))
     };
     let job = pair_job(images, (a, b), ("matches", stages::MATCHING_VERSION), params, work);
     let job = add_pair_job(graph, job, &looks.last, (a, b));
     graph.require(job, "own", own);
     graph.require(job, "first alone", looks.first[a]);
     graph.require(job, "second alone", looks.first[b]);
+    if let Some(carried) = carried {
+        graph.require(job, CARRIED, carried);
+    }
     job
 }
 
@@ -169,10 +207,10 @@ const MIN_TURNED: usize = 30;
 pub fn add_turned(
     graph: &mut JobGraph<'_>,
     source: PairSource<'_>,
-    features: &[JobId],
+    looks: &Looks,
     (a, b): (usize, usize),
 ) -> JobId {
-    let matches = add_matches(graph, source, features, (a, b));
+    let matches = add_matches(graph, source, looks, (a, b));
     let PairSource { images, seed, .. } = source;
     let (a, b) = in_order(images, (a, b));
     let seed = pair_seed(images, (a, b), seed);
@@ -194,7 +232,7 @@ pub fn add_turned(
         Product::new(TurnedPair(turned))
     };
     let job = pair_job(images, (a, b), ("turned", stages::TURNED_VERSION), params, work);
-    let turned = add_pair_job(graph, job, features, (a, b));
+    let turned = add_pair_job(graph, job, &looks.first, (a, b));
     graph.require(turned, "matches", matches);
     turned
 }
@@ -204,7 +242,7 @@ mod tests {
     use std::sync::Mutex;
     use std::sync::atomic::AtomicBool;
 
-    use setloc_features::{Camera, Match};
+    use setloc_features::Camera;
     use setloc_town::TownParams;
 
     use super::*;
@@ -223,7 +261,7 @@ mod tests {
         })
     }
 
-    /// What jobs match of a pair.
+    /// What jobs match of the first two of some images.
     fn by_jobs(images: &[SourceImage], config: &Config) -> Vec<Match> {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).unwrap();
@@ -274,6 +312,58 @@ mod tests {
         });
         let posture = stages::Posture::of([&images[0].camera, &images[1].camera]);
         stages::match_features(&config.matching, posture, &first, &second)
+    }
+
+    /// Photos of a rendered street, at the bottom of which the same is painted.
+    fn photos_over_a_bonnet(folder: &std::path::Path) -> Vec<SourceImage> {
+        let town = TownParams { panoramas: 1, panorama_width: 256, photos: 5, ..TownParams::default() };
+        setloc_town::write_dataset(folder, &town, 92).unwrap();
+        let photos = folder.join("queries").join("lane");
+        let mut names: Vec<_> =
+            std::fs::read_dir(&photos).unwrap().map(|file| file.unwrap().file_name()).collect();
+        names.sort();
+        let paint = |name: &std::ffi::OsString| {
+            let path = photos.join(name).with_extension("jpg");
+            let mut photo = image::open(&path).unwrap().to_rgb8();
+            let (width, height) = photo.dimensions();
+            for (x, y, pixel) in photo.enumerate_pixels_mut().filter(|(_, y, _)| *y > height - height / 5) {
+                // Patches of many greys.
+                let patch = (x / 9).wrapping_mul(2_654_435_761) ^ (y / 7).wrapping_mul(2_246_822_519);
+                *pixel = image::Rgb([(patch >> 13) as u8 / 2 + 60; 3]);
+            }
+            let path = path.with_extension("png");
+            photo.save(&path).unwrap();
+            let hash = ContentHash::of(&std::fs::read(&path).unwrap());
+            let camera = Camera::from_focal_guess(width, height, width.into());
+            SourceImage { path, hash, ..SourceImage::guessed(&name.to_string_lossy(), camera) }
+        };
+        names.iter().map(paint).collect()
+    }
+
+    #[test]
+    fn what_all_photos_of_a_camera_show_at_the_same_place_is_not_matched() {
+        let folder = tempfile::tempdir().unwrap();
+        let images = photos_over_a_bonnet(folder.path());
+        let (config, height) = (Config::default(), images[0].camera.height as f32);
+        let [first, second] = if is_swapped(&images, 0, 1) { [1, 0] } else { [0, 1] }.map(|at| {
+            let bytes = std::fs::read(&images[at].path).unwrap();
+            let decoded = stages::decode(&bytes, &stages::DecodeLimits::default()).unwrap();
+            stages::extract(&config.features, &decoded, &images[at].camera, None).unwrap()
+        });
+        let is_of_bonnet = |m: &&Match| {
+            let ends = [&first.keypoints[m.first as usize], &second.keypoints[m.second as usize]];
+            ends.iter().all(|keypoint| keypoint.y > 0.8 * height)
+        };
+        let count = |found: &[Match]| {
+            let carried = found.iter().filter(is_of_bonnet).count();
+            [carried, found.len() - carried]
+        };
+        let all = count(&stages::match_features(&config.matching, stages::Posture::Any, &first, &second));
+        let found = count(&by_jobs(&images, &config));
+        assert!(all[0] >= 50 && found[0] <= all[0] / 50, "{found:?} of {all:?} on the bonnet and elsewhere");
+        assert!(10 * found[1] >= 9 * all[1], "{found:?} of {all:?} on the bonnet and elsewhere");
+        // Of two photos nothing tells.
+        assert_eq!(count(&by_jobs(&images[..2], &config)), all);
     }
 
     #[test]

@@ -13,7 +13,7 @@ use setloc_sfm::{
 };
 
 use super::alignment::{KnownOfModel, add_alignment};
-use super::features::{Looks, accept_features, add_features_of, features_role};
+use super::features::{Looks, accept_features, features_role};
 use super::matching::{PairJobs, PairSource, add_pair, is_swapped};
 use super::positions::Measurements;
 use crate::artifacts::{PairMatches, VerifiedPair};
@@ -37,6 +37,8 @@ pub enum ModelKind {
 pub struct ModelJobs {
     /// One job an image.
     pub features: Vec<JobId>,
+    /// What tells what moves with the cameras of photos.
+    pub carried: Vec<JobId>,
     /// The job whose result the model is before it is aligned.
     pub mapped: JobId,
     /// The job whose result the model is.
@@ -83,13 +85,14 @@ pub fn add_model(
     let ModelSource { images, positions, pairs: chosen } = source;
     let looks = match kind {
         ModelKind::Scene => Looks::add(graph, images, config),
-        ModelKind::Local => Looks::once(add_features_of(graph, images, &config.photo_features())),
+        ModelKind::Local => Looks::once(graph, images, &config.photo_features()),
     };
     let mut pairs = Vec::new();
     for &(first, second) in chosen {
         let jobs = add_pair(graph, PairSource { images, config, seed }, &looks, (first, second));
         pairs.push(ModelPair { first, second, is_swapped: is_swapped(images, first, second), jobs });
     }
+    let carried = looks.all_carried();
     let features = looks.last;
     let cameras = share_cameras(images);
     let placed: Vec<_> =
@@ -141,7 +144,7 @@ pub fn add_model(
     } else {
         mapped
     };
-    Ok(ModelJobs { features, mapped, model, measured, pairs })
+    Ok(ModelJobs { features, carried, mapped, model, measured, pairs })
 }
 
 fn pair_role(pair: &ModelPair) -> String {

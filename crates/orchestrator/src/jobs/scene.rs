@@ -37,6 +37,8 @@ pub struct SceneInputs<'a> {
 pub struct SceneJobs {
     /// One job an image, in the order of the images given.
     pub features: Vec<JobId>,
+    /// What tells what moves with the cameras of photos.
+    pub carried: Vec<JobId>,
     /// The job whose result the model is.
     pub model: JobId,
     /// What the model leaves apart.
@@ -205,7 +207,7 @@ pub fn add_scene(graph: &mut JobGraph<'_>, inputs: SceneInputs<'_>) -> Result<Sc
         features[at] = job;
     }
     let finishing = if jobs.model == jobs.mapped { index } else { jobs.model };
-    Ok(SceneJobs { features, model: jobs.model, apart, scene, finishing })
+    Ok(SceneJobs { features, carried: jobs.carried, model: jobs.model, apart, scene, finishing })
 }
 
 /// Adds the job that indexes the components of a model.

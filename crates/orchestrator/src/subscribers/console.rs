@@ -8,8 +8,9 @@ use crate::graph::{Event, Observer};
 use crate::print;
 
 /// Stages in the order they are shown.
-const STAGES: [&str; 12] = [
+const STAGES: [&str; 13] = [
     "features",
+    "carried",
     "matches",
     "turned",
     "verify",

@@ -160,6 +160,7 @@ fn each_stage_s_parameter_runs_exactly_what_depends_on_it() {
     let all = [
         "aligned",
         "camset",
+        "carried",
         "features",
         "index",
         "left_apart",
