@@ -134,11 +134,11 @@ fn add_matches(
     let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
     let hashes = [images[a].hash, images[b].hash];
     let carried = looks.carried_by(pair);
-    let params = match carried {
-        // Which image is which decides what is carried.
-        Some(_) => json!({ "matching": config.matching, "posture": posture, "images": hashes }),
-        None => json!({ "matching": config.matching, "posture": posture }),
-    };
+    let mut params = json!({ "matching": config.matching, "posture": posture });
+    if carried.is_some() {
+        // Which images they are decides what of them is carried.
+        params["images"] = json!(hashes);
+    }
     let work = move |inputs: &Inputs<'_, '_>| {
         let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
         let found = stages::match_features(&matching, posture, &first, &second);
@@ -165,12 +165,10 @@ fn add_matches_of_views(
     let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
     let hashes = [images[a].hash, images[b].hash];
     let carried = looks.carried_by(pair);
-    let params = match carried {
-        Some(_) => {
-            json!({ "matching": config.matching, "posture": posture, "beside": "own", "images": hashes })
-        }
-        None => json!({ "matching": config.matching, "posture": posture, "beside": "own" }),
-    };
+    let mut params = json!({ "matching": config.matching, "posture": posture, "beside": "own" });
+    if carried.is_some() {
+        params["images"] = json!(hashes);
+    }
     let work = move |inputs: &Inputs<'_, '_>| {
         let features = |role: &str| inputs.get::<ImageFeatures>(role);
         let (first, second) = (features("first")?, features("second")?);
