@@ -92,17 +92,17 @@ impl CarriedCells {
     }
 }
 
-/// The matches of two photos of one size without those of what their cameras carry; all where both were taken from one pose.
+/// The matches of two photos without those of what their cameras carry; all where both were taken from one pose or have two sizes.
 pub fn without_carried_cells(
     matches: Vec<Match>,
     [of_first, of_second]: [&CarriedCells; 2],
     first: &ImageFeatures,
     second: &ImageFeatures,
 ) -> Vec<Match> {
-    if of_first.is_empty() || of_second.is_empty() {
+    let grid = Grid::of(first);
+    if of_first.is_empty() || of_second.is_empty() || grid != Grid::of(second) {
         return matches;
     }
-    let [first_grid, second_grid] = [first, second].map(Grid::of);
     let ends = |m: &Match| (&first.keypoints[m.first as usize], &second.keypoints[m.second as usize]);
     let is_still = |m: &&Match| {
         let (a, b) = ends(m);
@@ -111,8 +111,8 @@ pub fn without_carried_cells(
     // Beside what is carried there may be more of it that other photos do not show as well.
     let is_carried = |m: &&Match| {
         let (a, b) = ends(m);
-        of_first.show(a, first_grid) && of_second.show(b, second_grid)
-            || is_at(a, b) && of_first.are_next_to(a, first_grid) && of_second.are_next_to(b, second_grid)
+        of_first.show(a, grid) && of_second.show(b, grid)
+            || is_at(a, b) && of_first.are_next_to(a, grid) && of_second.are_next_to(b, grid)
     };
     let kept: Vec<Match> = matches.iter().filter(|m| !is_carried(m)).copied().collect();
     let still = kept.iter().filter(is_still).count();

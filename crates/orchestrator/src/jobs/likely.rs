@@ -143,12 +143,7 @@ impl Compared<'_> {
         let found = stages::match_features(matching, stages::Posture::Any, first, second);
         let posture = stages::Posture::of([a, b].map(|at| &self.cameras[at]));
         let found = without_carried(found, posture, first, second);
-        let size = |at: usize| (self.cameras[at].width, self.cameras[at].height);
-        if size(a) == size(b) {
-            without_carried_cells(found, [a, b].map(|at| &self.carried[at]), first, second).len()
-        } else {
-            found.len()
-        }
+        without_carried_cells(found, [a, b].map(|at| &self.carried[at]), first, second).len()
     }
 }
 

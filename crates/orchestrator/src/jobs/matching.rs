@@ -122,6 +122,26 @@ fn without_told_carried(
     Ok(without_carried_cells(matches, [of_first, of_second], first, second))
 }
 
+/// Adds a job that matches two images, which have these hashes, by these features, and may read what moves with their cameras.
+fn add_matching_job<'a>(
+    graph: &mut JobGraph<'a>,
+    mut job: Job<'a>,
+    hashes: [ContentHash; 2],
+    (looks, features): (&Looks, &[JobId]),
+    pair: (usize, usize),
+) -> JobId {
+    let carried = looks.carried_by(pair);
+    if carried.is_some() {
+        // Which images they are decides what of them is carried.
+        job.params["images"] = json!(hashes);
+    }
+    let job = add_pair_job(graph, job, features, pair);
+    if let Some(carried) = carried {
+        graph.require(job, CARRIED, carried);
+    }
+    job
+}
+
 /// Adds matching of one pair.
 fn add_matches(
     graph: &mut JobGraph<'_>,
@@ -133,23 +153,14 @@ fn add_matches(
     let matching = config.matching.clone();
     let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
     let hashes = [images[a].hash, images[b].hash];
-    let carried = looks.carried_by(pair);
-    let mut params = json!({ "matching": config.matching, "posture": posture });
-    if carried.is_some() {
-        // Which images they are decides what of them is carried.
-        params["images"] = json!(hashes);
-    }
+    let params = json!({ "matching": config.matching, "posture": posture });
     let work = move |inputs: &Inputs<'_, '_>| {
         let (first, second) = (inputs.get::<ImageFeatures>("first")?, inputs.get::<ImageFeatures>("second")?);
         let found = stages::match_features(&matching, posture, &first, &second);
         Product::new(PairMatches(without_told_carried(inputs, hashes, found, [&first, &second])?))
     };
     let job = pair_job(images, (a, b), ("matches", stages::MATCHING_VERSION), params, work);
-    let job = add_pair_job(graph, job, &looks.first, (a, b));
-    if let Some(carried) = carried {
-        graph.require(job, CARRIED, carried);
-    }
-    job
+    add_matching_job(graph, job, hashes, (looks, &looks.first), (a, b))
 }
 
 /// Adds to the matches of one pair those of the views that a second look simulates of either.
@@ -164,11 +175,7 @@ fn add_matches_of_views(
     let matching = config.matching.clone();
     let posture = stages::Posture::of([&images[a].camera, &images[b].camera]);
     let hashes = [images[a].hash, images[b].hash];
-    let carried = looks.carried_by(pair);
-    let mut params = json!({ "matching": config.matching, "posture": posture, "beside": "own" });
-    if carried.is_some() {
-        params["images"] = json!(hashes);
-    }
+    let params = json!({ "matching": config.matching, "posture": posture, "beside": "own" });
     let work = move |inputs: &Inputs<'_, '_>| {
         let features = |role: &str| inputs.get::<ImageFeatures>(role);
         let (first, second) = (features("first")?, features("second")?);
@@ -184,13 +191,10 @@ fn add_matches_of_views(
         Product::new(PairMatches(without_told_carried(inputs, hashes, found, [&first, &second])?))
     };
     let job = pair_job(images, (a, b), ("matches", stages::MATCHING_VERSION), params, work);
-    let job = add_pair_job(graph, job, &looks.last, (a, b));
+    let job = add_matching_job(graph, job, hashes, (looks, &looks.last), (a, b));
     graph.require(job, "own", own);
     graph.require(job, "first alone", looks.first[a]);
     graph.require(job, "second alone", looks.first[b]);
-    if let Some(carried) = carried {
-        graph.require(job, CARRIED, carried);
-    }
     job
 }
 
