@@ -34,6 +34,8 @@ struct SinglePose {
     misfit: Option<Misfit>,
     /// Whether it clearly shows another camera than it is told.
     is_contradicted: bool,
+    /// Whether it may have been cut from the side of a larger picture.
+    may_be_cut: bool,
     evidence: Evidence,
 }
 
@@ -98,6 +100,13 @@ pub(crate) fn locate_with_nearest(
         reasons.push("other intrinsics than it is told explain its matches clearly better".to_owned());
         verdict = weaker(verdict, Verdict::Uncertain);
     }
+    if found.may_be_cut {
+        reasons.push(
+            "it may have been cut from the side of a larger picture: that explains its matches as well"
+                .to_owned(),
+        );
+        verdict = weaker(verdict, Verdict::Uncertain);
+    }
     if let Some(misfit) = &found.misfit {
         reasons.push(misfit.to_string());
         verdict = weaker(verdict, Verdict::Uncertain);
@@ -127,7 +136,7 @@ fn solve(
     matches: &[SceneMatch],
     seed: u64,
 ) -> Option<SinglePose> {
-    let Fit { mut model, agreeing, is_contradicted, .. } =
+    let Fit { mut model, agreeing, is_contradicted, may_be_cut, .. } =
         Sought { params, scene, ground, photo, matches, seed }.fit(nearest)?;
     let (camera, pose) = (model.camera_of(0).clone(), model.photos[0].world_from_camera);
     let rays = PhotoRays::new(photo.features, &camera);
@@ -161,6 +170,7 @@ fn solve(
             depth,
             misfit: None,
             is_contradicted,
+            may_be_cut,
             evidence,
         });
     }
@@ -198,6 +208,7 @@ fn solve(
         depth,
         misfit,
         is_contradicted,
+        may_be_cut,
         evidence,
     })
 }
@@ -380,6 +391,40 @@ mod tests {
             assert!(center < 0.1 && rotation < 0.2, "{factor}: {center} {rotation}");
             let kept = locate(&SingleParams { check_intrinsics: false, ..SingleParams::default() });
             assert!(kept.camera == told, "{kept:#?}");
+        }
+    }
+
+    #[test]
+    fn a_picture_cut_from_a_larger_one_is_known_by_its_matches() {
+        for (seed, known) in [(11, false), (12, false), (13, false), (11, true), (12, true)] {
+            let mut world = World::chain(2, 0.2, seed);
+            // What is left of its picture without three tenths on the left and a quarter below.
+            let (left, below) = (0.3 * f64::from(world.camera.width), 0.25 * f64::from(world.camera.height));
+            for keypoint in &mut world.photos[0].features.keypoints {
+                keypoint.x -= left as f32;
+            }
+            let width = world.camera.width - left as u32;
+            let height = world.camera.height - below as u32;
+            let camera = if known {
+                let middle = [f64::from(width) / 2.0, f64::from(height) / 2.0];
+                let params = vec![800.0, 800.0, middle[0], middle[1]];
+                Camera { model: CameraModel::Pinhole, width, height, params }
+            } else {
+                Camera::from_focal_guess(width, height, 1.2 * f64::from(width))
+            };
+            let calibration = if known { Calibration::Known } else { Calibration::Guessed };
+            let query = QueryPhoto { camera: &camera, calibration, ..world.queries()[0] };
+            let found = locate_single(&SingleParams::default(), &world.scene(), &query, 5).answer.photo;
+            if known {
+                assert_ne!(found.verdict, Verdict::Localized, "{found:#?}");
+                continue;
+            }
+            assert_eq!(found.verdict, Verdict::Localized, "{found:#?}");
+            let truth = &world.camera.params;
+            let off = (found.camera.params[1] - (truth[2] - left)).hypot(found.camera.params[2] - truth[3]);
+            assert!(off < 10.0, "{off} {:?}", found.camera);
+            let (center, rotation) = world.errors(0, &found.world_from_camera.unwrap());
+            assert!(center < 0.1 && rotation < 0.5, "{center} {rotation}");
         }
     }
 

@@ -7,12 +7,15 @@
 //!
 //! The index is self-contained: it holds positions, covisibility and what guided matching needs of every
 //! observation, so no features and no reconstruction have to be kept beside it. It knows no poses of queries.
+//!
+//! [`images_alike`] tells, before there is a scene, which of many images are worth comparing at all.
 
 pub mod bytes;
 mod kernel;
 mod matching;
 mod nearest;
 mod params;
+mod retrieval;
 mod scene_index;
 mod search;
 
@@ -20,6 +23,7 @@ pub use kernel::squared_distances;
 pub use matching::{Correspondence, LocalDescriptors, PointCorrespondence};
 pub use nearest::{NearestPoints, Neighbour};
 pub use params::{Backend, IndexParams};
+pub use retrieval::images_alike;
 pub use scene_index::{IndexGrowth, Row, SceneIndex};
 
 /// Version of the index's contents; bumped whenever equal inputs give another index.

@@ -18,7 +18,7 @@ pub const MATCHING_VERSION: u32 = MatchParams::VERSION;
 /// Version of the comparison of all images by their strongest keypoints, and of the matching in it.
 pub const CARRIED_VERSION: u32 = setloc_features::CarriedCells::VERSION;
 /// Version of the stage.
-pub const LIKELY_VERSION: u32 = 1000 * MATCHING_VERSION + 3;
+pub const LIKELY_VERSION: u32 = 1000 * MATCHING_VERSION + 4;
 /// Version of what is said of a model's components.
 ///
 /// 2: of images that have features.

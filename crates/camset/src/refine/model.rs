@@ -44,6 +44,10 @@ pub(crate) enum KnownOfCamera {
     Alike(Camera),
     /// Its distortion and principal point: they stay. Of the focal length nothing.
     Distortion,
+    /// Nothing but what holds for usual photos, of which it may be a part.
+    Cut,
+    /// The same, and its distortion: it stays.
+    CutDistortion,
     /// Its intrinsics but for the focal lengths, which are near this one's.
     AllButFocal(Camera),
 }
@@ -61,7 +65,10 @@ impl JointCamera {
     pub fn freedom(&self) -> IntrinsicsFreedom {
         match self.known {
             KnownOfCamera::Intrinsics => IntrinsicsFreedom::FIXED,
-            KnownOfCamera::Usual | KnownOfCamera::Alike(_) => IntrinsicsFreedom::FREE,
+            KnownOfCamera::Usual | KnownOfCamera::Cut | KnownOfCamera::Alike(_) => IntrinsicsFreedom::FREE,
+            KnownOfCamera::CutDistortion => {
+                IntrinsicsFreedom { distortion: false, ..IntrinsicsFreedom::FREE }
+            }
             KnownOfCamera::Distortion | KnownOfCamera::AllButFocal(_) => {
                 IntrinsicsFreedom { focal: true, ..IntrinsicsFreedom::FIXED }
             }
@@ -73,6 +80,9 @@ impl JointCamera {
         match &self.known {
             KnownOfCamera::Alike(alike) => CameraPrior::alike(index, alike),
             KnownOfCamera::AllButFocal(near) => Some(CameraPrior::told(index, near)),
+            KnownOfCamera::Cut | KnownOfCamera::CutDistortion => {
+                CameraPrior::of_cut_photo(index, &self.camera)
+            }
             KnownOfCamera::Intrinsics | KnownOfCamera::Usual | KnownOfCamera::Distortion => {
                 CameraPrior::of_usual_photo(index, &self.camera)
             }

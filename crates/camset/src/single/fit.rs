@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::Vector2;
-use setloc_features::{Calibration, Camera, CameraModel};
+use setloc_features::{Calibration, Camera, CameraModel, ImageFeatures, ParamRole};
 use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::robust::{RansacParams, estimate_absolute_pose_focal};
 use setloc_sfm::{ImageId, Rigid};
@@ -49,6 +49,13 @@ const MAX_TOLD_ERROR: f64 = 1.35;
 /// few matches more or less agree with any.
 const FISHEYE_GAIN: f64 = 1.1;
 
+/// How often the noise of keypoints is halved until it is their own: from some hundred pixels on, as a principal point may be off.
+const BLUR_HALVINGS: [i32; 2] = [7, 5];
+/// How much more a picture that was cut has to explain than one that was not, in matches that agree exactly.
+const CUT_GAIN: f64 = 1.0;
+/// Share of the longer side from which on no lens has its principal point so far from the middle.
+const OFF_CENTRE: f64 = 0.02;
+
 /// What camera and pose are sought by.
 #[derive(Clone, Copy)]
 pub(super) struct Sought<'a> {
@@ -74,6 +81,8 @@ pub(super) struct Fit {
     pub agreeing: Vec<SceneMatch>,
     /// Whether another camera than the one that is told explains clearly more.
     pub is_contradicted: bool,
+    /// Whether a picture cut from the side of a larger one would explain as much.
+    pub may_be_cut: bool,
     score: f64,
 }
 
@@ -113,7 +122,47 @@ impl Sought<'_> {
         let with = self.fitted(without.hypothesis(), KnownOfCamera::Usual);
         let mut best = if with.score > without.score { with } else { without };
         best.model.cameras[0].known = KnownOfCamera::Usual;
-        Some(best)
+        Some(self.unless_cut(best))
+    }
+
+    /// The fit, or the one of a picture that was cut from a larger one where that explains clearly more.
+    fn unless_cut(&self, mut usual: Fit) -> Fit {
+        let Some(cut) = self.of_cut_picture(&usual) else { return usual };
+        let gain = cut.score - usual.score;
+        let least_gain = if is_off_centre(usual.model.camera_of(0)) { -CUT_GAIN } else { CUT_GAIN };
+        if gain > least_gain {
+            return cut;
+        }
+        usual.may_be_cut = gain > 0.0 && is_off_centre(cut.model.camera_of(0));
+        usual
+    }
+
+    /// The fit with the principal point wherever the matches have it.
+    ///
+    /// A picture that was cut from the side of a larger one is fitted by a turn in its place, and by matches of its own that agree with that, so
+    /// no small step leads from there. So keypoints are taken for so many times as noisy as they are that all matches tell, and for less
+    /// and less so. (A. Blake, A. Zisserman, "Visual Reconstruction", MIT Press 1987: graduated non-convexity.)
+    fn of_cut_picture(&self, from: &Fit) -> Option<Fit> {
+        best_of(BLUR_HALVINGS.into_iter().map(|halvings| self.annealed(from, halvings)))
+    }
+
+    /// The same from this much of a blur on.
+    fn annealed(&self, from: &Fit, halvings: i32) -> Fit {
+        let Self { params, scene, photo, matches, .. } = *self;
+        let mut model = from.model.clone();
+        model.cameras[0].known = KnownOfCamera::CutDistortion;
+        let mut blurred =
+            ImageFeatures { keypoints: photo.features.keypoints.clone(), ..ImageFeatures::default() };
+        for halvings in (1..=halvings).rev() {
+            let blur = 2.0_f32.powi(halvings);
+            for (keypoint, own) in blurred.keypoints.iter_mut().zip(&photo.features.keypoints) {
+                keypoint.noise_px = own.noise_px * blur;
+            }
+            let photo = QueryPhoto { features: &blurred, ..*photo };
+            refine(&mut model, scene, &photo, matches, params.max_error_sigmas, false);
+        }
+        let (camera, pose) = (model.camera_of(0).clone(), model.photos[0].world_from_camera);
+        self.fitted(Hypothesis { camera, pose, score: 0.0 }, KnownOfCamera::Cut)
     }
 
     /// Camera and pose where of the intrinsics the focal length is free, in turn so many times what is told or guessed.
@@ -144,7 +193,13 @@ impl Sought<'_> {
             let pose = model.photos[0].world_from_camera;
             let agreeing = inliers(&rays, scene.index, &pose, matches, params.max_error_sigmas);
             if model.cameras[0].is_known() || agreeing.len() <= most {
-                return Fit { agreeing, is_contradicted: false, score: self.score(&rays, &pose), model };
+                return Fit {
+                    agreeing,
+                    is_contradicted: false,
+                    may_be_cut: false,
+                    score: self.score(&rays, &pose),
+                    model,
+                };
             }
             most = agreeing.len();
         }
@@ -169,9 +224,12 @@ impl Sought<'_> {
             return told;
         };
         let of_usual = self.fitted(of_focal.hypothesis(), KnownOfCamera::Usual);
-        let shown = [&told, &of_focal, &of_usual].map(|fit| self.shown_by(nearest, fit));
+        let of_unusual =
+            self.of_cut_picture(&of_usual).filter(|cut| cut.score > of_usual.score).unwrap_or(of_usual);
+        let fits = [&told, &of_focal, &of_unusual];
+        let shown = fits.map(|fit| self.shown_by(nearest, fit));
         let seen = union(&union(&shown[0], &shown[1]), &shown[2]);
-        let [by_told, by_focal, by_usual] = [&told, &of_focal, &of_usual].map(|fit| self.cost_on(fit, &seen));
+        let [by_told, by_focal, by_unusual] = fits.map(|fit| self.cost_on(fit, &seen));
         let is_clear = |than: f64, cost: f64| than - cost > LEAST_SPARED.max(LEAST_SPARED_SHARE * than);
         let ratio = of_focal.model.camera_of(0).focal_length() / self.photo.camera.focal_length();
         let is_stretched = told.model.stretch.is_likely;
@@ -179,7 +237,7 @@ impl Sought<'_> {
         let is_of_lens = (least_change.ln()..=MAX_TOLD_ERROR.ln()).contains(&ratio.ln().abs());
         let is_other = is_telling(&of_focal) && is_of_lens && is_clear(by_told, by_focal);
         let (least, mut best) = if is_other { (by_focal, of_focal) } else { (by_told, told) };
-        best.is_contradicted = !is_stretched && least - by_focal.min(by_usual) > CONTRADICTED_SHARE * least;
+        best.is_contradicted = !is_stretched && least - by_focal.min(by_unusual) > CONTRADICTED_SHARE * least;
         best
     }
 
@@ -300,6 +358,18 @@ impl Fit {
     fn hypothesis(&self) -> Hypothesis {
         Hypothesis { camera: self.model.camera_of(0).clone(), pose: self.pose(), score: self.score }
     }
+}
+
+/// Whether the principal point is farther from the middle than lenses have it.
+fn is_off_centre(camera: &Camera) -> bool {
+    let (width, height) = (f64::from(camera.width), f64::from(camera.height));
+    let off = |(role, (name, value)): (&ParamRole, (&&str, &f64))| match (role, *name) {
+        (ParamRole::PrincipalPoint, "cx") => (value - width / 2.0).abs(),
+        (ParamRole::PrincipalPoint, _) => (value - height / 2.0).abs(),
+        _ => 0.0,
+    };
+    let named = camera.model.param_names().iter().zip(&camera.params);
+    camera.param_roles().iter().zip(named).map(off).any(|off| off > OFF_CENTRE * width.max(height))
 }
 
 /// The one of greatest score; of equals the last.

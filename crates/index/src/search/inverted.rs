@@ -80,7 +80,8 @@ impl InvertedLists {
         lists
     }
 
-    fn rows_of(&self, list: usize) -> std::ops::Range<usize> {
+    /// The places of a list's rows in the order of storage.
+    pub(crate) fn rows_of(&self, list: usize) -> std::ops::Range<usize> {
         self.starts[list] as usize..self.starts[list + 1] as usize
     }
 

@@ -1,11 +1,13 @@
 //! Which images look alike: pairs for large unordered sets whose places nobody measured.
 
+use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
 use anyhow::Result;
 use rayon::prelude::*;
 use serde_json::json;
 use setloc_features::{Camera, CarriedCells, ImageFeatures, without_carried, without_carried_cells};
+use setloc_index::images_alike;
 
 use super::carried::add_carried;
 use super::features::{add_features_of, features_role};
@@ -19,6 +21,9 @@ use crate::stages::{self, MatchParams};
 /// Keypoints by which images are compared, of the bright and of the dark. With half as many, 63 of 198 third neighbours of a
 /// rendered street were not among the 16 most alike in place of 30; with twice as many 14, at four times the work.
 const STRONGEST: usize = 512;
+
+/// For each image that is asked for, so many are looked at: those that most of its descriptors speak for.
+const CANDIDATES: usize = 3;
 
 /// Of how many most alike images the most alike are taken, too: the next on either side.
 const NEAREST: usize = 3;
@@ -147,31 +152,46 @@ impl Compared<'_> {
     }
 }
 
+/// The pairs that are compared: of few images all, else of each wanted one and those that most of its descriptors speak for.
+fn candidates(features: &[ImageFeatures], wanted: &[bool], most: usize) -> Vec<[usize; 2]> {
+    let (count, each) = (features.len(), most.saturating_mul(CANDIDATES));
+    let is_asked = |a: usize, b: usize| wanted[a] || wanted[b];
+    if count <= each + 1 {
+        let pairs = (0..count).flat_map(|a| (a + 1..count).map(move |b| [a, b]));
+        return pairs.filter(|&[a, b]| is_asked(a, b)).collect();
+    }
+    let descriptors: Vec<&[u8]> = features.iter().map(|features| &features.descriptors[..]).collect();
+    let found = images_alike(&descriptors, each, 0);
+    let of_one = |(a, others): (usize, &Vec<u32>)| {
+        others.iter().map(|&b| [a.min(b as usize), a.max(b as usize)]).collect::<Vec<_>>()
+    };
+    let mut pairs: Vec<[usize; 2]> =
+        found.iter().enumerate().filter(|&(at, _)| wanted[at]).flat_map(of_one).collect();
+    pairs.sort_unstable();
+    pairs.dedup();
+    pairs
+}
+
 /// For each wanted image so many others that share most matches with it, most first.
 fn most_alike(matching: &MatchParams, images: &Compared<'_>, wanted: &[bool], most: usize) -> Vec<Vec<u32>> {
     let matching = MatchParams { screen_features: 0, ..matching.clone() };
-    let count = images.features.len();
-    // Each pair once.
-    let rows: Vec<Vec<u32>> = (0..count)
-        .into_par_iter()
-        .with_max_len(1)
-        .map(|a| {
-            let shared = |b: usize| {
-                let is_asked = wanted[a] || wanted[b];
-                if is_asked { images.shared(&matching, [a, b]) as u32 } else { 0 }
-            };
-            (a + 1..count).map(shared).collect()
-        })
-        .collect();
-    let shared = |a: usize, b: usize| rows[a.min(b)][a.max(b) - a.min(b) - 1];
-    let likely = |a: usize| {
-        let mut others: Vec<u32> = (0..count as u32).filter(|&b| b as usize != a).collect();
-        others.retain(|&b| shared(a, b as usize) > 0);
-        others.sort_by_key(|&b| (std::cmp::Reverse(shared(a, b as usize)), b));
+    let pairs = candidates(images.features, wanted, most);
+    let shared: Vec<u32> =
+        pairs.par_iter().with_max_len(1).map(|&pair| images.shared(&matching, pair) as u32).collect();
+    let mut likely = vec![Vec::new(); wanted.len()];
+    for (&[a, b], &shared) in pairs.iter().zip(&shared).filter(|&(_, &shared)| shared > 0) {
+        for (at, other) in [(a, b), (b, a)] {
+            if wanted[at] {
+                likely[at].push((Reverse(shared), other as u32));
+            }
+        }
+    }
+    let most_of = |mut others: Vec<(Reverse<u32>, u32)>| {
+        others.sort_unstable();
         others.truncate(most);
-        others
+        others.into_iter().map(|(_, other)| other).collect()
     };
-    (0..count).map(|a| if wanted[a] { likely(a) } else { Vec::new() }).collect()
+    likely.into_iter().map(most_of).collect()
 }
 
 #[cfg(test)]

@@ -119,6 +119,9 @@ const UNUSUAL: f64 = 2.0;
 
 /// Deviation of focal lengths that are not told apart, as a share.
 const ALIKE_FOCAL: f64 = 0.01;
+/// Share of the longer side by which the principal point of a picture that was cut lies off its centre: a third cut off on one side is a
+/// sixth of what was there, and a quarter of what is left.
+const CUT: f64 = 0.2;
 /// Share by which a term of distortion that is told may move the corners of an image otherwise.
 const AT_CORNER: f64 = 0.005;
 
@@ -155,6 +158,19 @@ impl CameraPrior {
         let parameters = camera.param_roles().iter().zip(camera.model.param_names()).map(known).collect();
         let loss = if camera.is_stretched() { RobustLoss::Trivial } else { RobustLoss::Cauchy(UNUSUAL) };
         Some(Self { camera: index, parameters, aspect_sigma: 0.001, loss })
+    }
+
+    /// What holds for a picture that may have been cut from the side of a larger one: the principal point lies within 20 % of the longer
+    /// side of the image's centre. Everything else is as for the usual photo, but no loss lets go of it.
+    pub fn of_cut_photo(index: u32, camera: &Camera) -> Option<Self> {
+        let mut prior = Self::of_usual_photo(index, camera)?;
+        let longer = f64::from(camera.width.max(camera.height));
+        let of_role = prior.parameters.iter_mut().zip(camera.param_roles());
+        for (known, _) in of_role.filter(|(_, role)| **role == ParamRole::PrincipalPoint) {
+            known.sigma = CUT * longer;
+        }
+        prior.loss = RobustLoss::Trivial;
+        Some(prior)
     }
 
     /// What holds for the usual photo, and that the focal length is within 1 % of this camera's.
