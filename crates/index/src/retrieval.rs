@@ -19,16 +19,6 @@ const VOTE: f64 = 256.0;
 /// of 1.5. Each votes for the 16 images that it has the nearest descriptors in, by 1 − d / d₁₆ of their distances: what is in many images
 /// alike speaks for none. (H. Jégou, M. Douze, C. Schmid, "Exploiting descriptor distances for precise image search", INRIA
 /// RR-7656, 2011.)
-///
-/// ```
-/// use setloc_index::images_alike;
-///
-/// let [street, square] = [[10; 128], [90; 128]];
-/// let near = |descriptor: [u8; 128], by: u8| descriptor.map(|value| value + by);
-/// let photos = [street, square, near(street, 1), near(square, 1), near(street, 5)];
-/// let alike = images_alike(&photos.each_ref().map(|photo| &photo[..]), 1, 0);
-/// assert_eq!(alike[0], [2]);
-/// ```
 pub fn images_alike(descriptors: &[&[u8]], most: usize, seed: u64) -> Vec<Vec<u32>> {
     let rows = descriptors.concat();
     let of_image = |(image, of_image): (u32, &&[u8])| {
