@@ -22,7 +22,7 @@ use crate::stages::{self, MatchParams};
 /// rendered street were not among the 16 most alike in place of 30; with twice as many 14, at four times the work.
 const STRONGEST: usize = 512;
 
-/// For each image that is asked for, so many are looked at: those that most of its descriptors speak for.
+/// So many times as many images as are asked for are compared with each: those that most of its descriptors speak for.
 const CANDIDATES: usize = 3;
 
 /// Of how many most alike images the most alike are taken, too: the next on either side.
@@ -94,7 +94,8 @@ impl LikelyJobs {
             name: name.to_owned(),
             params,
             external: BTreeMap::new(),
-            memory: images.len() as u64 * (STRONGEST as u64 * 2 * 160),
+            // Features, their descriptors once more, and the votes of each two.
+            memory: images.len() as u64 * (STRONGEST as u64 * 2 * 320 + images.len() as u64 * 2),
             work: Box::new(work),
         });
         for (at, &features) in features.iter().enumerate() {
@@ -230,6 +231,20 @@ mod tests {
         let wanted = [false, false, true, false, false, false];
         let one = most_alike(&MatchParams::default(), &images, &wanted, 1);
         assert_eq!(one, [vec![], vec![], vec![1], vec![], vec![], vec![]]);
+    }
+
+    #[test]
+    fn of_many_images_those_that_inverted_lists_propose_are_compared() {
+        let count = 60;
+        let (features, cameras) = (street(count), vec![Camera::equirectangular(100, 50); count]);
+        let carried = vec![CarriedCells::default(); count];
+        let images = Compared { features: &features, carried: &carried, cameras: &cameras };
+        let pairs = candidates(&features, &[true; 60], 2);
+        assert!(pairs.len() <= 6 * count, "{}", pairs.len());
+        let found = most_alike(&MatchParams::default(), &images, &[true; 60], 2);
+        for (at, others) in (0_u32..).zip(&found).skip(1).take(count - 2) {
+            assert_eq!(others, &[at - 1, at + 1]);
+        }
     }
 
     #[test]
