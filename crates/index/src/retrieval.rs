@@ -3,7 +3,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use rayon::prelude::*;
 use setloc_features::{DESCRIPTOR_LEN, offer_nearer};
 
-use crate::search::InvertedLists;
+use crate::search::{InvertedLists, descriptor};
 
 /// Other images that a descriptor may vote for. With 8 and 4 of them the 48 first of 1200 rendered panoramas hold 0.64 and
 /// 0.58 in place of 0.68 of what an exact comparison finds most alike, with 32 the same.
@@ -29,8 +29,8 @@ pub fn images_alike(descriptors: &[&[u8]], most: usize, seed: u64) -> Vec<Vec<u3
     let votes = Votes::new(descriptors.len());
     (0..lists.lists()).into_par_iter().with_max_len(1).for_each(|list| {
         let of_list = &order[lists.rows_of(list)];
-        let row = |row: &u32| &rows[*row as usize * DESCRIPTOR_LEN..(*row as usize + 1) * DESCRIPTOR_LEN];
-        let descriptors = of_list.iter().map(row).collect::<Vec<_>>().concat();
+        let descriptors =
+            of_list.iter().map(|&row| descriptor(&rows, row as usize)).collect::<Vec<_>>().concat();
         let images: Vec<u32> = of_list.iter().map(|&row| owners[row as usize]).collect();
         let mut nearest: Vec<NearestImages> =
             images.iter().map(|&image| NearestImages { image, found: Vec::new() }).collect();

@@ -5,7 +5,7 @@ mod inverted;
 mod kd_tree;
 
 pub(crate) use exact::nearest_exact;
-pub(crate) use inverted::InvertedLists;
+pub(crate) use inverted::{InvertedLists, descriptor};
 pub(crate) use kd_tree::PrincipalTree;
 
 use serde::{Deserialize, Serialize};

@@ -126,7 +126,8 @@ impl InvertedLists {
     }
 }
 
-fn descriptor(descriptors: &[u8], row: usize) -> &[u8] {
+/// One row of row-major descriptors.
+pub(crate) fn descriptor(descriptors: &[u8], row: usize) -> &[u8] {
     &descriptors[row * DESCRIPTOR_LEN..(row + 1) * DESCRIPTOR_LEN]
 }
 
