@@ -81,7 +81,7 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// scene points stand as they do alone. 52: unknown focal lengths by P4Pf, too. 53: told focal lengths are asked for by the joint refinement.
 /// 54: and by photos alone; what residuals have in common makes poses uncertain.
 /// 55: photos alone that were cut from the side of a larger picture are found as such.
-pub const VERSION: u32 = 55;
+pub const VERSION: u32 = 56;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 /// 2: points shift to where moved rays meet.

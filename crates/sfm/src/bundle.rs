@@ -32,6 +32,7 @@ mod problem;
 mod residual;
 mod response;
 mod spherical;
+mod wide;
 
 use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
@@ -77,7 +78,8 @@ pub struct BundleParams {
     pub max_iterations: u32,
     /// Ends when a step decreases the cost by less than this share.
     pub function_tolerance: f64,
-    /// Ends when a step is shorter than this share of the parameters' norm.
+    /// Ends when a step is shorter than this share of the norm of the camera side's parameters, and that of each point than this share
+    /// of its distance from the origin.
     pub parameter_tolerance: f64,
     /// How the reduced camera system of each step is solved.
     pub linear_solver: LinearSolver,

@@ -77,7 +77,7 @@ use self::{
 use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind, bundle::BundleParams};
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 68;
+pub const MAPPER_VERSION: u32 = 69;
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///
@@ -620,8 +620,11 @@ impl<'a> Mapper<'a> {
     }
 
     fn adjust_all_by(&mut self, params: &BundleParams) {
-        let scope = Scope::global(&self.model);
-        adjust(&mut self.model, params, &scope);
+        self.adjust_within(params, &Scope::global(&self.model));
+    }
+
+    fn adjust_within(&mut self, params: &BundleParams, scope: &Scope) {
+        adjust(&mut self.model, params, scope);
         self.follow_anchors();
     }
 
@@ -631,9 +634,21 @@ impl<'a> Mapper<'a> {
     }
 
     fn refine_within(&mut self, limits: PointLimits, rounds: usize, max_iterations: u32) {
+        self.refine_by(Scope::global, limits, rounds, max_iterations);
+    }
+
+    /// The same, of which adjustments move what is in a scope alone.
+    fn refine_by(
+        &mut self,
+        scope: impl Fn(&Model<'a>) -> Scope,
+        limits: PointLimits,
+        rounds: usize,
+        max_iterations: u32,
+    ) {
         for _ in 0..rounds {
             let observations = self.model.observation_count();
-            self.adjust_all(max_iterations);
+            let scope = scope(&self.model);
+            self.adjust_within(&self.params.bundle(max_iterations), &scope);
             let mut changes = self.filter_all(limits);
             let before: usize = self.model.live_points().count();
             for image in self.model.registered().collect::<Vec<_>>() {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::Vector2;
-use setloc_features::{Calibration, Camera, CameraModel, ImageFeatures, ParamRole};
+use setloc_features::{Calibration, Camera, CameraModel, ImageFeatures};
 use setloc_index::{NearestPoints, SceneIndex};
 use setloc_sfm::robust::{RansacParams, estimate_absolute_pose_focal};
 use setloc_sfm::{ImageId, Rigid};
@@ -267,6 +267,7 @@ impl Sought<'_> {
     fn at_best_focal(&self, nearest: &[NearestPoints], first: Fit) -> Fit {
         let shown = |fit: &Fit| self.shown_by(nearest, fit).len();
         let JointCamera { camera, known } = first.model.cameras[0].clone();
+        let may_be_cut = first.may_be_cut;
         let (mut most, mut best) = (shown(&first), first);
         if most >= TELLING {
             return best;
@@ -287,6 +288,7 @@ impl Sought<'_> {
             }
         }
         best.model.cameras[0].known = known;
+        best.may_be_cut = may_be_cut;
         best
     }
 
@@ -362,14 +364,8 @@ impl Fit {
 
 /// Whether the principal point is farther from the middle than lenses have it.
 fn is_off_centre(camera: &Camera) -> bool {
-    let (width, height) = (f64::from(camera.width), f64::from(camera.height));
-    let off = |(role, (name, value)): (&ParamRole, (&&str, &f64))| match (role, *name) {
-        (ParamRole::PrincipalPoint, "cx") => (value - width / 2.0).abs(),
-        (ParamRole::PrincipalPoint, _) => (value - height / 2.0).abs(),
-        _ => 0.0,
-    };
-    let named = camera.model.param_names().iter().zip(&camera.params);
-    camera.param_roles().iter().zip(named).map(off).any(|off| off > OFF_CENTRE * width.max(height))
+    let size = Vector2::new(f64::from(camera.width), f64::from(camera.height));
+    camera.principal_point().is_some_and(|center| (center - size / 2.0).amax() > OFF_CENTRE * size.max())
 }
 
 /// The one of greatest score; of equals the last.

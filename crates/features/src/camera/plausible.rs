@@ -33,9 +33,14 @@ impl Camera {
             .map_or(Ok(()), |reason| Err(FeatureError::InvalidCamera { model: self.model.name(), reason }))
     }
 
+    /// Where the optical axis meets the image, in pixels from its upper left corner; panoramas have none.
+    pub fn principal_point(&self) -> Option<Vector2<f64>> {
+        self.lens().map(|(_, k)| k.center)
+    }
+
     /// The principal point, where it is not in the image, as only crops have it.
     pub fn principal_point_aside(&self) -> Option<Vector2<f64>> {
-        self.lens().map(|(_, k)| k.center).filter(|center| !self.contains(center))
+        self.principal_point().filter(|center| !self.contains(center))
     }
 
     /// The share of the image's pixels that have a ray.
@@ -185,8 +190,9 @@ mod tests {
             ..Camera::from_focal_guess(300, 200, 900.0)
         };
         assert_eq!(crop(299.0).principal_point_aside(), None);
+        assert_eq!(crop(299.0).principal_point(), Some(Vector2::new(299.0, 100.0)));
         assert_eq!(crop(-40.0).principal_point_aside(), Some(Vector2::new(-40.0, 100.0)));
-        assert_eq!(Camera::equirectangular(200, 100).principal_point_aside(), None);
+        assert_eq!(Camera::equirectangular(200, 100).principal_point(), None);
         assert_eq!(crop(150.0).share_with_rays(), 1.0);
         let fisheye = Camera {
             model: SimpleFisheye,

@@ -2,7 +2,7 @@
 
 use setloc_index::SceneIndex;
 use setloc_sfm::{
-    ImageId, ModelErrors, OutvotedPair, Reconstruction, SuspiciousNeighbours, UnconfirmedPair,
+    ImageId, MOST_NAMED, ModelErrors, OutvotedPair, Reconstruction, SuspiciousNeighbours, UnconfirmedPair,
     doubtful_images, listed,
 };
 
@@ -90,7 +90,7 @@ impl Doubt {
         match self {
             Self::Folded(images) => (!images.is_empty()).then(|| {
                 let names: Vec<&str> = images.iter().map(|image| name(*image)).collect();
-                let names = names.join(", ");
+                let names = listed(&names, MOST_NAMED);
                 format!("photos of what {names} show will be uncertain: the model may be folded there")
             }),
             Self::Unconfirmed(UnconfirmedPair { first, second, points }) => Some(format!(

@@ -143,9 +143,10 @@ impl Records {
 
     /// Brings the index up to date with the folder.
     fn list(&self) {
+        // Locked first: what is written meanwhile would be in the index and not in the list, as if it had been removed.
+        let mut index = self.lock();
         let present: BTreeSet<Arc<Path>> =
             self.files().unwrap_or_default().into_iter().map(Arc::from).collect();
-        let mut index = self.lock();
         index.listed = Some(Instant::now());
         if !index.files.is_subset(&present) {
             (index.files, index.places) = (BTreeSet::new(), HashMap::new());
@@ -313,6 +314,29 @@ mod tests {
         let (kind, params) = ("test".to_owned(), serde_json::json!({ "text": "a\nb" }));
         let fingerprint = Fingerprint { kind, version, params, inputs: BTreeMap::new() };
         KeyRecord::new(fingerprint, ContentHash::of(file), file, 0.5)
+    }
+
+    #[test]
+    fn what_was_written_is_found_while_others_list_the_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        let records = Records::at(folder.path().to_owned());
+        let is_done = std::sync::atomic::AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                while !is_done.load(std::sync::atomic::Ordering::Relaxed) {
+                    records.list();
+                    std::thread::sleep(Duration::from_micros(100));
+                }
+            });
+            let lost = (0..100).filter(|&version| {
+                let written = record(version, b"small");
+                records.add(std::slice::from_ref(&written)).unwrap();
+                (0..20).any(|_| records.find_listed(written.key).is_none())
+            });
+            let lost = lost.count();
+            is_done.store(true, std::sync::atomic::Ordering::Relaxed);
+            assert_eq!(lost, 0);
+        });
     }
 
     #[test]

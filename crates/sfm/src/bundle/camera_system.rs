@@ -32,22 +32,29 @@ pub(super) struct Budget {
     values: usize,
     /// Most multiplications and additions of one factorization.
     operations: f64,
+    /// Whether points that many cameras see may be kept out of S: rounding may then hide that it is singular.
+    allows_wide: bool,
 }
 
 impl Budget {
     /// Whatever it takes: as much as offsets of 32 bits reach, 32 GiB.
-    const ANY: Self = Self { values: u32::MAX as usize, operations: f64::INFINITY };
-    /// What fits into memory, however long it takes.
-    pub const MEMORY: Self = Self { values: MAX_VALUES, ..Self::ANY };
+    const ANY: Self = Self { values: u32::MAX as usize, operations: f64::INFINITY, allows_wide: true };
+    /// What fits into memory, however long it takes; S as a whole.
+    pub const MEMORY: Self = Self { values: MAX_VALUES, operations: f64::INFINITY, allows_wide: false };
 
     /// What a solver spends on a problem of so many observations before it leaves S implicit.
     pub fn new(solver: LinearSolver, observations: usize) -> Self {
         let operations = MIN_OPERATIONS.max(OPERATIONS_PER_OBSERVATION * observations as f64);
         match solver {
-            LinearSolver::Auto => Self { operations, ..Self::MEMORY },
+            LinearSolver::Auto => Self { values: MAX_VALUES, operations, allows_wide: true },
             LinearSolver::Direct => Self::ANY,
-            LinearSolver::Iterative => Self { values: 0, operations: 0.0 },
+            LinearSolver::Iterative => Self { values: 0, operations: 0.0, allows_wide: false },
         }
+    }
+
+    /// Whether some points may be kept out of an S of this pattern: a small one is factorized as a full matrix anyway.
+    pub fn allows_wide(&self, pattern: &BlockPattern) -> bool {
+        self.allows_wide && pattern.size() > DENSE_SIZE
     }
 
     /// What is left when so many numbers are stored elsewhere.
@@ -82,25 +89,25 @@ pub(super) enum CameraSystem {
 }
 
 impl CameraSystem {
-    /// Chooses the factorization and allocates for it; `None` when it is beyond the budget.
-    pub fn new(pattern: &BlockPattern, budget: &Budget) -> Option<Self> {
+    /// Chooses the factorization and allocates for it and for so many right-hand sides; `None` when it is beyond the budget.
+    pub fn new(pattern: &BlockPattern, columns: usize, budget: &Budget) -> Option<Self> {
         let size = pattern.size();
         let fill = pattern.len() as f64 / (0.5 * (size * size) as f64).max(1.0);
         if size > DENSE_SIZE && fill < DENSE_FILL {
-            return Self::sparse(pattern, budget);
+            return Self::sparse(pattern, columns, budget);
         }
         let operations = (size as f64).powi(3) / 3.0;
         let fits = size.checked_mul(size)? <= budget.values && operations <= budget.operations;
-        fits.then(|| Self::dense(size))
+        fits.then(|| Self::dense(size, columns))
     }
 
-    fn dense(size: usize) -> Self {
+    fn dense(size: usize, columns: usize) -> Self {
         let scratch = factor::cholesky_in_place_scratch::<f64>(size, Par::Seq, faer::Spec::default())
-            .or(solve::solve_in_place_scratch::<f64>(size, 1, Par::Seq));
+            .or(solve::solve_in_place_scratch::<f64>(size, columns, Par::Seq));
         Self::Dense { matrix: Mat::zeros(size, size), memory: MemBuffer::new(scratch) }
     }
 
-    fn sparse(pattern: &BlockPattern, budget: &Budget) -> Option<Self> {
+    fn sparse(pattern: &BlockPattern, columns: usize, budget: &Budget) -> Option<Self> {
         // Row indices and values.
         if 2 * pattern.len() > budget.values {
             return None;
@@ -125,12 +132,13 @@ impl CameraSystem {
         )
         .ok()?;
         let values = 2 * rows.len() + symbolic.len_val();
-        if values > budget.values || operations(&symbolic) > budget.operations {
+        let to_solve = 2.0 * columns as f64 * symbolic.len_val() as f64;
+        if values > budget.values || operations(&symbolic) + to_solve > budget.operations {
             return None;
         }
         let scratch = symbolic
             .factorize_numeric_llt_scratch::<f64>(Par::Seq, faer::Spec::default())
-            .or(symbolic.solve_in_place_scratch::<f64>(1, Par::Seq));
+            .or(symbolic.solve_in_place_scratch::<f64>(columns, Par::Seq));
         Some(Self::Sparse {
             values: vec![0.0; rows.len()],
             factor: vec![0.0; symbolic.len_val()],
@@ -207,10 +215,10 @@ impl CameraSystem {
         }
     }
 
-    /// Solves for one right-hand side in place, after a successful [`CameraSystem::factorize`].
-    pub fn solve(&mut self, right: &mut [f64]) {
-        let size = right.len();
-        let right = MatMut::from_column_major_slice_mut(right, size, 1);
+    /// Solves for so many right-hand sides in place, after a successful [`CameraSystem::factorize`].
+    pub fn solve(&mut self, right: &mut [f64], columns: usize) {
+        let size = right.len() / columns;
+        let right = MatMut::from_column_major_slice_mut(right, size, columns);
         match self {
             Self::Dense { matrix, memory } => {
                 solve::solve_in_place(matrix.as_ref(), right, Par::Seq, MemStack::new(memory));
@@ -275,13 +283,13 @@ mod tests {
     #[test]
     fn dense_and_sparse_solve_the_system_twice() {
         let (pattern, blocks, full) = example(40);
-        let sparse = CameraSystem::sparse(&pattern, &Budget::ANY).unwrap();
-        for mut system in [sparse, CameraSystem::dense(pattern.size())] {
+        let sparse = CameraSystem::sparse(&pattern, 1, &Budget::ANY).unwrap();
+        for mut system in [sparse, CameraSystem::dense(pattern.size(), 1)] {
             for round in 0..2 {
                 assert!(system.factorize(&pattern, &blocks));
                 let truth = Mat::from_fn(pattern.size(), 1, |row, _| (row as f64 + f64::from(round)).cos());
                 let mut right = (&full * &truth).col_as_slice(0).to_vec();
-                system.solve(&mut right);
+                system.solve(&mut right, 1);
                 for (row, value) in right.iter().enumerate() {
                     assert!((value - truth[(row, 0)]).abs() < 1e-12);
                 }
@@ -292,16 +300,17 @@ mod tests {
     #[test]
     fn large_sparse_patterns_take_the_sparse_path() {
         let (pattern, ..) = example(200);
-        assert!(matches!(CameraSystem::new(&pattern, &Budget::ANY), Some(CameraSystem::Sparse { .. })));
-        assert!(matches!(CameraSystem::new(&example(30).0, &Budget::ANY), Some(CameraSystem::Dense { .. })));
+        let system = |pattern: &BlockPattern| CameraSystem::new(pattern, 1, &Budget::ANY);
+        assert!(matches!(system(&pattern), Some(CameraSystem::Sparse { .. })));
+        assert!(matches!(system(&example(30).0), Some(CameraSystem::Dense { .. })));
     }
 
     #[test]
     fn refuses_an_indefinite_matrix() {
         let (pattern, mut blocks, _) = example(40);
         blocks[pattern.offset(7, 7)] = -1.0;
-        assert!(!CameraSystem::sparse(&pattern, &Budget::ANY).unwrap().factorize(&pattern, &blocks));
-        assert!(!CameraSystem::dense(pattern.size()).factorize(&pattern, &blocks));
+        assert!(!CameraSystem::sparse(&pattern, 1, &Budget::ANY).unwrap().factorize(&pattern, &blocks));
+        assert!(!CameraSystem::dense(pattern.size(), 1).factorize(&pattern, &blocks));
     }
 
     #[test]
@@ -318,7 +327,7 @@ mod tests {
         // Σ k² over all columns: the same whatever the order.
         for count in [1, 30] {
             let Some(CameraSystem::Sparse { symbolic, .. }) =
-                CameraSystem::sparse(&full(count), &Budget::ANY)
+                CameraSystem::sparse(&full(count), 1, &Budget::ANY)
             else {
                 panic!("sparse was asked for");
             };
@@ -330,12 +339,12 @@ mod tests {
         let budget = |operations: f64| Budget { operations, ..Budget::ANY };
         let least = (pattern.len() as f64).powi(2) / pattern.size() as f64;
         assert!(budget(least * 1.01).may_suffice(&pattern) && !budget(least * 0.99).may_suffice(&pattern));
-        assert!(CameraSystem::new(&pattern, &budget(120.0_f64.powi(3) * 0.34)).is_some());
-        assert!(CameraSystem::new(&pattern, &budget(120.0_f64.powi(3) * 0.32)).is_none());
+        assert!(CameraSystem::new(&pattern, 1, &budget(120.0_f64.powi(3) * 0.34)).is_some());
+        assert!(CameraSystem::new(&pattern, 1, &budget(120.0_f64.powi(3) * 0.32)).is_none());
         let (sparse, ..) = example(200);
-        assert!(CameraSystem::new(&sparse, &budget(1e3)).is_none());
+        assert!(CameraSystem::new(&sparse, 1, &budget(1e3)).is_none());
         assert!(
-            CameraSystem::new(&sparse, &Budget { values: 3 * sparse.len() / 2, ..Budget::ANY }).is_none()
+            CameraSystem::new(&sparse, 1, &Budget { values: 3 * sparse.len() / 2, ..Budget::ANY }).is_none()
         );
     }
 }

@@ -29,9 +29,31 @@ pub(super) struct Couplings {
     pub slots: Vec<Slot>,
     /// Whether each point is an unknown.
     pub free: Vec<bool>,
+    /// Whether each point is kept out of S; empty where none is.
+    pub wide: Vec<bool>,
 }
 
 impl Couplings {
+    #[inline]
+    pub fn is_wide(&self, point: usize) -> bool {
+        !self.wide.is_empty() && self.wide[point]
+    }
+
+    /// Blocks of S that a point has a share in: row and column, column ≤ row.
+    pub fn for_each_pair(&self, point: usize, mut take: impl FnMut(usize, usize)) {
+        let of_point = self.of_point(point);
+        for (index, row) in of_point.iter().enumerate() {
+            for column in &of_point[..=index] {
+                take(row.block as usize, column.block as usize);
+            }
+        }
+    }
+
+    /// Adds these blocks.
+    pub fn insert(&self, point: usize, pattern: &mut BlockPattern) {
+        self.for_each_pair(point, |row, column| pattern.insert(row, column));
+    }
+
     #[inline]
     pub fn of_point(&self, point: usize) -> &[Slot] {
         &self.slots[self.starts[point]..self.starts[point + 1]]
@@ -53,6 +75,8 @@ pub(super) struct Chunk {
     pub gradient: Vec<f64>,
     /// −W V⁻¹ Wᵀ in the blocks of the pattern; of an implicit S its diagonal blocks alone.
     pub schur: Vec<f64>,
+    /// Columns of W V⁻¹ᐟ² of each slot of wide points.
+    pub wide: Vec<f64>,
     /// W V⁻¹ times g_p, or times Wᵀx.
     pub reduced: Vec<f64>,
     pub scratch: Vec<f64>,
@@ -67,10 +91,12 @@ pub(super) struct Chunk {
 pub(super) struct StepSums {
     /// Decrease of the quadratic model.
     pub predicted: f64,
-    /// ‖δ‖².
+    /// ‖δ‖² of the camera side.
     pub squared_step: f64,
-    /// ‖parameters‖².
-    pub squared_norm: f64,
+    /// Largest ‖δ‖² of a point, as a share of the square of its distance from the origin.
+    ///
+    /// Of each by itself: beside one that rays make run off to infinity no step of all others is large.
+    pub largest_point_step: f64,
 }
 
 /// Rows of the blocks of stitched panoramas' cameras, the most frequent beside poses.
@@ -80,6 +106,7 @@ impl Chunk {
     /// Subtracts W V⁻¹ Wᵀ from S and adds up W V⁻¹ g_p, for damping λ.
     pub fn eliminate<const D: usize>(&mut self, lambda: f64, couplings: &Couplings, pattern: &BlockPattern) {
         self.schur.fill(0.0);
+        self.wide.clear();
         self.reduced.fill(0.0);
         self.usable = true;
         let is_implicit = !self.factors.is_empty();
@@ -111,6 +138,13 @@ impl Chunk {
                     (y[row], y[dim + row], y[2 * dim + row]) = (y0, y1, y2);
                     reduced[row] += y0 * z0 + y1 * z1 + y2 * z2;
                 }
+            }
+            if couplings.is_wide(point) {
+                for slot in of_point {
+                    let y = &self.scratch[slot.offset as usize - first..];
+                    self.wide.extend_from_slice(&y[..3 * pattern.dim(slot.block as usize)]);
+                }
+                continue;
             }
             for (position, row) in of_point.iter().enumerate() {
                 let row_dim = pattern.dim(row.block as usize);
@@ -201,8 +235,8 @@ impl Chunk {
             for (k, diagonal) in [v[0], v[2], v[5]].into_iter().enumerate() {
                 self.sums.predicted += 0.5 * delta[k] * (lambda * bounded(diagonal) * delta[k] - g[k]);
             }
-            self.sums.squared_step += delta.norm_squared();
-            self.sums.squared_norm += points[point].norm_squared();
+            let relative = delta.norm_squared() / points[point].norm_squared();
+            self.sums.largest_point_step = self.sums.largest_point_step.max(relative);
         }
     }
 }

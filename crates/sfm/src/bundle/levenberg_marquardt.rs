@@ -118,8 +118,9 @@ pub(super) fn minimize<const D: usize, M: Model<D>>(
                 outcome.termination = Termination::Converged;
                 break;
             }
-            let small = limits.parameter_tolerance * (sums.squared_norm + model.squared_norm()).sqrt();
-            let is_small_step = sums.squared_step.sqrt() <= small;
+            let least = limits.parameter_tolerance.powi(2);
+            let is_small_step =
+                sums.squared_step <= least * model.squared_norm() && sums.largest_point_step <= least;
             if candidate < cost {
                 let decrease = cost - candidate;
                 let ratio = decrease / sums.predicted;

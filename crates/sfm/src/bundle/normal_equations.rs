@@ -8,8 +8,8 @@
 //! Work is cut into chunks of consecutive points whose number depends on the problem alone; each sums into its own
 //! memory and the chunks are added in order, so the bytes do not depend on the number of threads.
 //!
-//! S is formed and factorized while that is within a [`Budget`]; beyond, only its diagonal blocks are, and products with
-//! it are made from U, V and W.
+//! S is formed and factorized while that is within a [`Budget`], but for what [wide points](super::wide) add; beyond, only its
+//! diagonal blocks are, and products with it are made from U, V and W.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -21,6 +21,7 @@ use super::elimination::{Chunk, Couplings, Slot, StepSums, bounded, for_each_chu
 use super::iterative::{ImplicitSchur, IterativeSystem};
 use super::loss::LossSum;
 use super::pattern::{BlockPattern, NONE};
+use super::wide::{WidePoints, fill_by_narrow};
 
 /// Upper bound of the chunk count; more would cost more in reductions than it gains.
 const MAX_CHUNKS: usize = 8;
@@ -79,7 +80,7 @@ pub(super) trait Model<const D: usize>: Sync {
     fn propose(&mut self, step: &[f64]) -> bool;
     /// Makes the candidate the current state.
     fn accept(&mut self);
-    /// Sum of squares of the camera-side parameters, for the relative step size.
+    /// Sum of squares of the camera-side parameters, for the relative size of their step.
     fn squared_norm(&self) -> f64;
 }
 
@@ -112,8 +113,8 @@ pub(super) struct Structure {
 #[expect(clippy::large_enum_variant, reason = "one per problem, never moved in a loop")]
 /// How S δ = b is solved.
 enum ReducedSystem {
-    /// By a factorization of S.
-    Direct(CameraSystem),
+    /// By a factorization of S, or of what it is without wide points and what these add.
+    Direct(CameraSystem, Option<WidePoints>),
     /// By products with S.
     Iterative(IterativeSystem),
 }
@@ -158,9 +159,8 @@ impl<const D: usize> NormalEquations<D> {
         }
         let mut observation_starts = Vec::with_capacity(points.len() + 1);
         observation_starts.push(0);
-        let mut couplings = Couplings { starts: vec![0], slots: Vec::new(), free };
-        let mut work_until = Vec::with_capacity(points.len());
-        let (mut work, mut end, mut touched) = (0, 0, Vec::new());
+        let mut couplings = Couplings { starts: vec![0], slots: Vec::new(), free, wide: Vec::new() };
+        let (mut end, mut touched) = (0, Vec::new());
         for point in 0..points.len() {
             let start = end;
             while end < links.len() && links[end].point as usize == point {
@@ -182,19 +182,29 @@ impl<const D: usize> NormalEquations<D> {
             couplings.slots.extend(touched.iter().map(|&block| Slot { block, offset: 0 }));
             couplings.starts.push(couplings.slots.len());
             observation_starts.push(end);
-            work += 2 * (end - start) + touched.len() * touched.len();
-            work_until.push(work);
         }
 
+        let filled = with_fill(&pattern, &mut couplings, budget);
+        let mut work = 0;
+        let work_until: Vec<usize> = (0..points.len())
+            .map(|point| {
+                let touched = if couplings.is_wide(point) { 0 } else { couplings.of_point(point).len() };
+                work += 2 * (observation_starts[point + 1] - observation_starts[point]) + touched * touched;
+                work
+            })
+            .collect();
         let chunks_of = |len: usize| {
             (work / WORK_PER_CHUNK).clamp(1, (MAX_CHUNK_VALUES / len.max(1)).clamp(1, MAX_CHUNKS))
         };
-        let direct = with_fill(&pattern, &couplings, budget).and_then(|filled| {
-            let accumulated = filled.len() * (1 + chunks_of(filled.len()));
-            let system = CameraSystem::new(&filled, &budget.without(accumulated)?)?;
-            Some((filled, ReducedSystem::Direct(system)))
+        let direct = filled.and_then(|filled| {
+            let columns = WidePoints::columns(&couplings);
+            let accumulated = filled.len() * (1 + chunks_of(filled.len())) + 2 * columns * filled.size();
+            let system = CameraSystem::new(&filled, columns.max(1), &budget.without(accumulated)?)?;
+            let wide = WidePoints::new(filled.size(), columns);
+            Some((filled, ReducedSystem::Direct(system, wide)))
         });
         let (pattern, system) = direct.unwrap_or_else(|| {
+            couplings.wide.clear();
             let system = ReducedSystem::Iterative(IterativeSystem::new(&pattern));
             (pattern, system)
         });
@@ -304,7 +314,7 @@ impl<const D: usize> NormalEquations<D> {
     /// The iterative system with its counts, unless S is factorized.
     pub fn iterative(&self) -> Option<&IterativeSystem> {
         match &self.system {
-            ReducedSystem::Direct(_) => None,
+            ReducedSystem::Direct(..) => None,
             ReducedSystem::Iterative(system) => Some(system),
         }
     }
@@ -482,10 +492,13 @@ impl<const D: usize> NormalEquations<D> {
     }
 
     fn factorize_schur(&mut self) -> bool {
-        let Self { pattern, schur, system, .. } = self;
+        let Self { pattern, schur, system, chunks, couplings, .. } = self;
         match system {
             _ if pattern.size() == 0 => true,
-            ReducedSystem::Direct(system) => system.factorize(pattern, schur),
+            ReducedSystem::Direct(system, wide) => {
+                system.factorize(pattern, schur)
+                    && wide.as_mut().is_none_or(|wide| wide.factorize((chunks, couplings, pattern), system))
+            }
             ReducedSystem::Iterative(system) => system.prepare(pattern, schur),
         }
     }
@@ -505,8 +518,8 @@ impl<const D: usize> NormalEquations<D> {
             return true;
         }
         match system {
-            ReducedSystem::Direct(system) => {
-                system.solve(step);
+            ReducedSystem::Direct(system, wide) => {
+                solve_by(system, wide.as_mut(), step);
                 true
             }
             ReducedSystem::Iterative(system) => {
@@ -555,8 +568,7 @@ impl<const D: usize> NormalEquations<D> {
         }
         for chunk in &self.chunks {
             sums.predicted += chunk.sums.predicted;
-            sums.squared_step += chunk.sums.squared_step;
-            sums.squared_norm += chunk.sums.squared_norm;
+            sums.largest_point_step = sums.largest_point_step.max(chunk.sums.largest_point_step);
         }
         let cost = if is_valid {
             self.chunks.iter().map(|chunk| chunk.cost).sum::<f64>() + model.prior_cost()
@@ -590,8 +602,8 @@ impl<const D: usize> NormalEquations<D> {
     /// Solves S x = `right` in place, after [`NormalEquations::factorize`]; false when S is not factorized as a whole.
     pub fn solve_camera_side(&mut self, right: &mut [f64]) -> bool {
         match &mut self.system {
-            ReducedSystem::Direct(system) => {
-                system.solve(right);
+            ReducedSystem::Direct(system, wide) => {
+                solve_by(system, wide.as_mut(), right);
                 true
             }
             ReducedSystem::Iterative(_) => false,
@@ -599,21 +611,28 @@ impl<const D: usize> NormalEquations<D> {
     }
 }
 
-/// The blocks of U and those that shared points fill in; `None` when their are beyond the budget.
-fn with_fill(base: &BlockPattern, couplings: &Couplings, budget: &Budget) -> Option<BlockPattern> {
+/// The blocks of U and those that shared points fill in, some of which may be marked as wide and left out; `None` when they are
+/// beyond the budget.
+fn with_fill(base: &BlockPattern, couplings: &mut Couplings, budget: &Budget) -> Option<BlockPattern> {
     let mut pattern = base.clone();
+    if budget.allows_wide(base) {
+        return fill_by_narrow(&mut pattern, couplings, budget).then_some(pattern);
+    }
     for point in 0..couplings.free.len() {
         if !budget.may_suffice(&pattern) {
             return None;
         }
-        let of_point = couplings.of_point(point);
-        for (index, row) in of_point.iter().enumerate() {
-            for column in &of_point[..=index] {
-                pattern.insert(row.block as usize, column.block as usize);
-            }
-        }
+        couplings.insert(point, &mut pattern);
     }
     Some(pattern)
+}
+
+/// Solves S x = `right` in place by what is factorized.
+fn solve_by(of_narrow: &mut CameraSystem, wide: Option<&mut WidePoints>, right: &mut [f64]) {
+    of_narrow.solve(right, 1);
+    if let Some(wide) = wide {
+        wide.complete(right);
+    }
 }
 
 /// Values of S that one task sums over all chunks.
@@ -752,11 +771,82 @@ mod tests {
             [(LinearSolver::Auto, true), (LinearSolver::Direct, true), (LinearSolver::Iterative, false)]
         {
             let equations = NormalEquations::<3>::new(structure(), &Budget::new(solver, count));
-            assert_eq!(matches!(equations.system, ReducedSystem::Direct(_)), is_direct, "{solver:?}");
+            assert_eq!(matches!(equations.system, ReducedSystem::Direct(..)), is_direct, "{solver:?}");
         }
         let needed = NormalEquations::<3>::new(structure(), &Budget::MEMORY).pattern.len();
         let tight = Budget::MEMORY.without((1 << 28) - needed).unwrap();
         let equations = NormalEquations::<3>::new(structure(), &tight);
         assert!(matches!(equations.system, ReducedSystem::Iterative(_)), "no room for the factor");
+    }
+
+    /// A street, of which neighbours see what lies at it, and four points that all see.
+    fn street(blocks: u32) -> (Linear, impl Fn() -> Structure) {
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        let (mut links, mut linear) = (Vec::new(), Vec::new());
+        let seen_by = |point: u32| {
+            if point % blocks == 40 && point > blocks {
+                0..blocks
+            } else {
+                point % blocks..(point % blocks + 3).min(blocks)
+            }
+        };
+        for point in 0..5 * blocks {
+            for block in seen_by(point) {
+                links.push(Link { point, block, extra: block % 2 });
+                let mut draw = || rng.random_range(-1.0..1.0);
+                linear.push(Linearized {
+                    residual: [draw(), draw()],
+                    point: [(); 2].map(|()| [(); 3].map(|()| draw())),
+                    block: [(); 2].map(|()| [(); 3].map(|()| draw())),
+                    extra: [(); 2].map(|()| [(); MAX_CAMERA_PARAMS].map(|()| draw())),
+                });
+            }
+        }
+        let structure = move || Structure {
+            links: links.clone(),
+            points: vec![Vector3::zeros(); 5 * blocks as usize],
+            free: (0..5 * blocks).map(|point| point != 4 * blocks + 40).collect(),
+            block_count: blocks as usize,
+            extra_dims: vec![2, 4],
+        };
+        (Linear(linear), structure)
+    }
+
+    #[test]
+    fn points_that_all_see_are_kept_out_of_the_system_and_leave_its_solution_as_it_is() {
+        let (model, structure) = street(250);
+        let direct = Budget::new(LinearSolver::Direct, model.0.len());
+        let mut equations =
+            [direct, Budget::MEMORY].map(|budget| NormalEquations::<3>::new(structure(), &budget));
+        let wide =
+            |equations: &NormalEquations<3>| equations.couplings.wide.iter().filter(|&&wide| wide).count();
+        assert_eq!(equations.each_ref().map(wide), [3, 0], "the fourth is no unknown");
+        assert!(4 * equations[0].pattern.len() < equations[1].pattern.len());
+        for lambda in [1e-3, 1.0] {
+            let steps = equations.each_mut().map(|equations| {
+                equations.linearize(&model, 1.0);
+                assert!(equations.factorize(lambda) && equations.solve());
+                let mut column = vec![0.0; equations.step().len()];
+                column[7] = 1.0;
+                assert!(equations.solve_camera_side(&mut column));
+                [equations.step().to_vec(), column]
+            });
+            for (step, expected) in steps[0].iter().flatten().zip(steps[1].iter().flatten()) {
+                assert!((step - expected).abs() < 1e-9, "{step} {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_system_that_wide_points_make_indefinite_is_refused() {
+        let (model, structure) = street(250);
+        let mut equations =
+            NormalEquations::<3>::new(structure(), &Budget::new(LinearSolver::Direct, model.0.len()));
+        equations.linearize(&model, 1e-3);
+        assert!(equations.factorize(1e-3));
+        for chunk in &mut equations.chunks {
+            chunk.wide.iter_mut().for_each(|value| *value *= 10.0);
+        }
+        assert!(!equations.factorize_schur());
     }
 }

@@ -65,6 +65,14 @@ impl BlockPattern {
         }
     }
 
+    /// Whether there is a block; `column` ≤ `row`.
+    pub fn contains(&self, row: usize, column: usize) -> bool {
+        if self.table.is_empty() {
+            return self.columns[column].binary_search_by_key(&(row as u32), |block| block.0).is_ok();
+        }
+        self.table[packed(row, column)] != NONE
+    }
+
     /// Value offset of an existing block; `column` ≤ `row`.
     #[inline]
     pub fn offset(&self, row: usize, column: usize) -> usize {

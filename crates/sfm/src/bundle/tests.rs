@@ -376,6 +376,28 @@ fn odd_input_is_survived_and_counted() {
     );
 }
 
+/// Rays that are all but parallel make one of it, of which the first step of all others is a share below any tolerance.
+#[test]
+fn a_point_that_is_all_but_infinitely_far_away_does_not_end_the_adjustment() {
+    let mut truth = scene(8, 300, 0.0, 40);
+    let far = Vector3::new(0.3, 0.2, 1.0) * 1e13;
+    let point = truth.points.len() as u32;
+    truth.points.push(BundlePoint { position: far, fixed: false });
+    for pose in [0, 2] {
+        let in_camera = truth.poses[pose].world_from_camera.inverse().transform_point(&far);
+        let pixel = truth.cameras[0].project(&in_camera).expect("panoramas see all round");
+        truth.observations.push(BundleObservation { pose: pose as u32, point, pixel, noise_px: 0.5 });
+    }
+    let mut problem = truth.clone();
+    let away = problem.points.pop().expect("was pushed");
+    perturb(&mut problem, 0.02, 41);
+    problem.points.push(away);
+    let report = solve(&BundleParams::default(), &mut problem);
+    assert!(report.iterations > 2, "{report:?}");
+    let (rotation, position) = largest_error(&problem, &truth);
+    assert!(rotation < 1e-5 && position < 1e-4, "{rotation} {position} {report:?}");
+}
+
 #[test]
 fn bytes_do_not_depend_on_the_number_of_threads() {
     let mut start = scene(12, 1500, 0.5, 22);

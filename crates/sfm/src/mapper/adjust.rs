@@ -47,6 +47,24 @@ impl Scope {
         }
     }
 
+    /// Images and those that share enough points with them to be moved by them, the others held; everything where that is most of it.
+    ///
+    /// What a join at one end of a place does to the other end is for the adjustment of the finished whole.
+    pub fn about(model: &Model<'_>, images: &[ImageId]) -> Self {
+        let mut shared = vec![0_usize; model.poses.len()];
+        for point in model.seen_by(images).into_iter().filter_map(|id| model.point(id)) {
+            point.track.iter().for_each(|seen| shared[seen.image.index()] += 1);
+        }
+        let is_near =
+            |image: &ImageId| images.contains(image) || shared[image.index()] >= MIN_ADJUSTABLE_POINTS;
+        let free_images: Vec<ImageId> = model.registered().filter(is_near).collect();
+        if 2 * free_images.len() > model.registered_count() {
+            return Self::global(model);
+        }
+        let points = model.seen_by(&free_images);
+        Self { free_images, points, intrinsics: Intrinsics::None }
+    }
+
     /// `image` and the `neighbours` images that share most points with it, with all points that any of them sees: what a
     /// neighbour sees beside the image holds it, too.
     pub fn local(model: &Model<'_>, image: ImageId, neighbours: usize) -> Self {
@@ -215,10 +233,25 @@ mod tests {
     use super::super::{
         MapperParams,
         structure::triangulate_image,
-        test_street::{Street, first_two},
+        test_street::{POINTS, Street, first_two},
     };
     use super::*;
     use crate::{Rigid, synthetic::rotation_angle};
+
+    #[test]
+    fn about_some_images_those_that_share_points_with_them_are_free_unless_that_is_most() {
+        let street = Street::new("about", 60, POINTS);
+        let input = street.input();
+        let mut model = first_two(&street, &input);
+        model.set_pose(ImageId(2), Some(street.poses[2]));
+        let about = |model: &Model<'_>, image: u32| Scope::about(model, &[ImageId(image)]);
+        let apart = about(&model, 2);
+        assert_eq!((&apart.free_images[..], apart.points.len()), (&[ImageId(2)][..], 0), "nothing is shared");
+        assert_eq!(apart.intrinsics, Intrinsics::None);
+        let of_most = about(&model, 0);
+        assert_eq!(of_most.free_images.len(), 3);
+        assert_eq!((of_most.points, of_most.intrinsics), (model.live_ids(), Intrinsics::Unknown));
+    }
 
     /// A third image that shares a few far points with the others has no say in how these stand to each other.
     #[test]

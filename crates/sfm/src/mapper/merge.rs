@@ -30,6 +30,7 @@ use self::{
 };
 use super::{
     Mapper, MapperInput, MapperParams, MapperReport,
+    adjust::Scope,
     depths::is_indoors,
     latecomers::belongs_elsewhere,
     model::Model,
@@ -141,6 +142,8 @@ impl MergeRecord {
     }
 }
 
+/// How many times as many matches as when they were tried in vain make two parts worth another try at once.
+const MIN_GROWTH: f64 = 1.1;
 /// Fewest matches of a similarity that more are sought for.
 const MIN_SEED: usize = 6;
 /// Pairs of images about which similarities are sought where all matches together give none, and images of either
@@ -190,7 +193,7 @@ impl<'a> Parts<'a> {
     ///
     /// A whole is finished when nothing more joins it: that takes far longer than all else about a join.
     pub fn join_supported(&mut self) {
-        let (mut tried, mut models) = (BTreeSet::new(), ModelsOfParts::new());
+        let (mut tried, mut models) = (Tried::default(), ModelsOfParts::new());
         let mut joined_images = BTreeSet::new();
         loop {
             self.sort();
@@ -211,7 +214,7 @@ impl<'a> Parts<'a> {
 
     /// Joins parts of panoramas by single pairs whose length depths tell, largest first; whether any were joined.
     pub fn join_hung(&mut self) -> bool {
-        let (mut tried, mut models) = (BTreeSet::new(), ModelsOfParts::new());
+        let (mut tried, mut models) = (Tried::default(), ModelsOfParts::new());
         let mut has_joined = false;
         loop {
             self.sort();
@@ -239,48 +242,121 @@ impl<'a> Parts<'a> {
 
     /// What comes of the first two parts that something comes of, and which these are; their models are then forgotten, as they
     /// change.
+    ///
+    /// Two that were tried in vain come last, unless one of them has since grown by much that the other matches.
     fn first_joined(
         &mut self,
         by: Evidence,
-        tried: &mut BTreeSet<[PartState; 2]>,
+        tried: &mut Tried,
         models: &mut ModelsOfParts<'a>,
     ) -> Option<(usize, usize, Outcome)> {
         for part in &self.all {
             models.entry(part.first()).or_default();
         }
-        for (kept, larger) in self.all.iter().enumerate() {
-            let known = &models[&larger.first()];
-            if matches!(by, Evidence::Depths) && !is_indoors(known.model(self.input, larger)) {
+        let mut put_off = Vec::new();
+        for kept in 0..self.all.len() {
+            let larger = &self.all[kept];
+            let is_outdoors = || !is_indoors(models[&larger.first()].model(self.input, larger));
+            if matches!(by, Evidence::Depths) && is_outdoors() {
                 continue;
             }
-            for (moved, smaller) in self.all.iter().enumerate().skip(kept + 1) {
-                if !tried.insert([larger.state(), smaller.state()]) {
+            for moved in kept + 1..self.all.len() {
+                let parts = [kept, moved];
+                let [larger, smaller] = parts.map(|part| &self.all[part]);
+                if !tried.states.insert([larger.state(), smaller.state()]) {
                     continue;
                 }
-                let taken = self.taken_by_all_but(&[kept, moved]);
-                let known = [(known, larger), (&models[&smaller.first()], smaller)];
-                let [of_kept, of_moved] = known.map(|(known, part)| known.model(self.input, part));
-                let attempt = Attempt {
-                    params: self.params,
-                    kept: larger,
-                    moved: smaller,
-                    sides: Sides { kept: of_kept, moved: of_moved },
-                    rates: known.map(|(known, _)| &known.rates),
-                    seed: self.seed,
-                };
-                let outcome = match by {
-                    Evidence::Matches => attempt.run(taken, &mut self.report).map(Outcome::Joined),
-                    Evidence::Depths => attempt.run_hung(taken, &mut self.report.merges),
-                };
-                if let Some(outcome) = outcome {
-                    for changed in [larger.first(), smaller.first()] {
-                        models.remove(&changed);
+                let (matches, growth) = match by {
+                    Evidence::Matches => {
+                        let matches = self.attempt(parts, models).sides.crossings().len();
+                        (matches, tried.growth([larger, smaller], matches))
                     }
-                    return Some((kept, moved, outcome));
+                    Evidence::Depths => (0, f64::INFINITY),
+                };
+                if growth < MIN_GROWTH {
+                    put_off.push((growth, parts, matches));
+                } else if let Some(outcome) = self.outcome(by, parts, models) {
+                    return Some(self.forgetting(models, parts, outcome));
+                } else {
+                    tried.fail(parts.map(|part| &self.all[part]), matches);
                 }
             }
         }
+        put_off.sort_by(|one, other| other.0.total_cmp(&one.0));
+        for (_, parts, matches) in put_off {
+            if let Some(outcome) = self.outcome(by, parts, models) {
+                return Some(self.forgetting(models, parts, outcome));
+            }
+            tried.fail(parts.map(|part| &self.all[part]), matches);
+        }
         None
+    }
+
+    fn attempt<'p>(&'p self, parts: [usize; 2], models: &'p ModelsOfParts<'a>) -> Attempt<'p, 'p, 'a> {
+        let [kept, moved] = parts.map(|part| &self.all[part]);
+        let known = [kept, moved].map(|part| (&models[&part.first()], part));
+        let [of_kept, of_moved] = known.map(|(known, part)| known.model(self.input, part));
+        Attempt {
+            params: self.params,
+            kept,
+            moved,
+            sides: Sides { kept: of_kept, moved: of_moved },
+            rates: known.map(|(known, _)| &known.rates),
+            seed: self.seed,
+        }
+    }
+
+    fn outcome(&mut self, by: Evidence, parts: [usize; 2], models: &ModelsOfParts<'a>) -> Option<Outcome> {
+        let taken = self.taken_by_all_but(&parts);
+        let mut report = std::mem::take(&mut self.report);
+        let attempt = self.attempt(parts, models);
+        let outcome = match by {
+            Evidence::Matches => attempt.run(&taken, &mut report).map(Outcome::Joined),
+            Evidence::Depths => attempt.run_hung(taken, &mut report.merges),
+        };
+        self.report = report;
+        outcome
+    }
+
+    /// An outcome and its parts, whose models are forgotten.
+    fn forgetting(
+        &self,
+        models: &mut ModelsOfParts<'a>,
+        [kept, moved]: [usize; 2],
+        outcome: Outcome,
+    ) -> (usize, usize, Outcome) {
+        for changed in [kept, moved] {
+            models.remove(&self.all[changed].first());
+        }
+        (kept, moved, outcome)
+    }
+}
+
+/// Which parts were tried.
+#[derive(Default)]
+struct Tried {
+    states: BTreeSet<[PartState; 2]>,
+    /// First images of two in vain, and the matches between them then.
+    in_vain: Vec<([ImageId; 2], usize)>,
+}
+
+impl Tried {
+    /// How many times as many matches there are between two parts as when any two of which they were made were tried in vain.
+    fn growth(&self, parts: [&Part; 2], matches: usize) -> f64 {
+        let has = |part: usize, image: ImageId| {
+            parts[part].component.images[image.index()].world_from_camera.is_some()
+        };
+        let are_of =
+            |[one, other]: [ImageId; 2]| has(0, one) && has(1, other) || has(0, other) && has(1, one);
+        let before =
+            self.in_vain.iter().filter(|(images, _)| are_of(*images)).map(|(_, matches)| *matches).max();
+        before.map_or(f64::INFINITY, |before| matches as f64 / before.max(1) as f64)
+    }
+
+    fn fail(&mut self, parts: [&Part; 2], matches: usize) {
+        if let [Some(one), Some(other)] = parts.map(Part::first) {
+            self.in_vain.push(([one, other], matches));
+        }
     }
 }
 
@@ -345,7 +421,7 @@ struct Attempt<'p, 'm, 'a> {
 }
 
 impl<'a> Attempt<'_, '_, 'a> {
-    fn run(&self, taken: Vec<bool>, report: &mut MapperReport) -> Option<Part> {
+    fn run(&self, taken: &[bool], report: &mut MapperReport) -> Option<Part> {
         let crossings = self.sides.crossings();
         let candidates = distinct(&crossings);
         if candidates < self.params.min_registration_inliers {
@@ -752,23 +828,23 @@ impl<'a> Attempt<'_, '_, 'a> {
     }
 
     /// The joined component, unless the adjustment of both together contradicts the similarity.
-    fn join(&self, hypothesis: &Hypothesis, taken: Vec<bool>) -> Option<Mapper<'a>> {
-        let mut mapper = self.mapper_over(&hypothesis.kept_from_moved, taken);
-        let limits = self.params.limits();
-        for _ in 0..2 {
-            for crossing in &hypothesis.agreeing {
-                connect(&mut mapper.model, limits, crossing.kept, crossing.moved);
-            }
-            complete_and_merge(&mut mapper.model, &mapper.graph, limits);
-            mapper.refine(2, 20);
-        }
-        if !self.holds(&mapper, hypothesis) {
+    ///
+    /// Of a large component that meets a small one only what is about the seam is adjusted, if that contradicts nothing.
+    fn join(&self, hypothesis: &Hypothesis, taken: &[bool]) -> Option<Mapper<'a>> {
+        let about_seam = |model: &Model<'a>| Scope::about(model, &self.moved_images());
+        let (mapper, is_partial) = self.adjusted(hypothesis, taken, about_seam);
+        let mut mapper = if self.holds(&mapper, hypothesis) {
+            mapper
+        } else if is_partial {
+            let (whole, _) = self.adjusted(hypothesis, taken, Scope::global);
+            Some(whole).filter(|whole| self.holds(whole, hypothesis))?
+        } else {
             return None;
-        }
+        };
         let before = mapper.model.registered_count();
         mapper.grow();
         if mapper.model.registered_count() > before {
-            mapper.refine(2, 20);
+            mapper.refine_by(about_seam, self.params.limits(), 2, 20);
         }
         mapper.replace_misplaced();
         // Where a part ends an image may have come in askew by a few points, which the other part has hundreds of matches with.
@@ -778,6 +854,31 @@ impl<'a> Attempt<'_, '_, 'a> {
             images.filter(|image| !mapper.model.is_registered(*image) && !may_leave(of, *image)).count()
         };
         self.fit_but_few(&mapper.model, [self.kept, self.moved].map(num_lost)).then_some(mapper)
+    }
+
+    /// Both at a similarity, adjusted together within a scope, and whether anything was beyond that.
+    fn adjusted(
+        &self,
+        hypothesis: &Hypothesis,
+        taken: &[bool],
+        scope: impl Fn(&Model<'a>) -> Scope,
+    ) -> (Mapper<'a>, bool) {
+        let mut mapper = self.mapper_over(&hypothesis.kept_from_moved, taken.to_vec());
+        let limits = self.params.limits();
+        let mut is_partial = false;
+        for _ in 0..2 {
+            for crossing in &hypothesis.agreeing {
+                connect(&mut mapper.model, limits, crossing.kept, crossing.moved);
+            }
+            complete_and_merge(&mut mapper.model, &mapper.graph, limits);
+            is_partial |= scope(&mapper.model).free_images.len() < mapper.model.registered_count();
+            mapper.refine_by(&scope, limits, 2, 20);
+        }
+        (mapper, is_partial)
+    }
+
+    fn moved_images(&self) -> Vec<ImageId> {
+        self.moved.component.registered().collect()
     }
 
     /// The model of both, that images may join but those that are taken.
@@ -882,12 +983,38 @@ fn outweighs_walls(agreeing: usize, expected: f64, least: f64) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{CameraId, Reconstruction, ReconstructionImage};
 
     /// One of four images of a house stands on the upper floor.
     #[test]
     fn more_images_may_be_unfit_where_pairs_leave_no_doubt() {
         assert!(may_be_unfit(0, 2, false) && may_be_unfit(1, 8, false) && !may_be_unfit(1, 4, false));
         assert!(may_be_unfit(1, 4, true) && !may_be_unfit(2, 4, true) && !may_be_unfit(1, 2, true));
+    }
+
+    #[test]
+    fn parts_that_were_tried_in_vain_are_worth_another_try_when_they_have_grown_by_matches() {
+        let part = |images: &[u32]| {
+            let image = |number: u32| ReconstructionImage {
+                name: number.to_string(),
+                camera: CameraId(0),
+                world_from_camera: images.contains(&number).then(Rigid::identity),
+            };
+            let component =
+                Reconstruction { images: (0..8).map(image).collect(), ..Reconstruction::default() };
+            Part { component, anchors: vec![None; 8] }
+        };
+        let (large, small) = (part(&[2, 3, 4]), part(&[6, 7]));
+        let mut tried = Tried::default();
+        assert_eq!(tried.growth([&large, &small], 100), f64::INFINITY);
+        tried.fail([&large, &small], 100);
+        // The large one is known as another's part, whose first image is not its own, and on either side.
+        let grown = part(&[0, 1, 2, 3, 4]);
+        assert_eq!(tried.growth([&grown, &small], 109), 1.09);
+        assert_eq!(tried.growth([&small, &grown], 150), 1.5);
+        assert_eq!(tried.growth([&part(&[0, 1]), &small], 10), f64::INFINITY);
+        tried.fail([&grown, &small], 140);
+        assert_eq!(tried.growth([&grown, &small], 140), 1.0);
     }
 
     /// Figures of parts of a church, a street and rendered streets, in their places and in wrong ones.
