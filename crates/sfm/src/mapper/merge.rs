@@ -263,7 +263,7 @@ impl<'a> Parts<'a> {
             for moved in kept + 1..self.all.len() {
                 let parts = [kept, moved];
                 let [larger, smaller] = parts.map(|part| &self.all[part]);
-                if !tried.states.insert([larger.state(), smaller.state()]) {
+                if tried.states.contains(&[larger.state(), smaller.state()]) {
                     continue;
                 }
                 let (matches, growth) = match by {
@@ -275,19 +275,16 @@ impl<'a> Parts<'a> {
                 };
                 if growth < MIN_GROWTH {
                     put_off.push((growth, parts, matches));
-                } else if let Some(outcome) = self.outcome(by, parts, models) {
+                } else if let Some(outcome) = self.outcome(by, (parts, matches), tried, models) {
                     return Some(self.forgetting(models, parts, outcome));
-                } else {
-                    tried.fail(parts.map(|part| &self.all[part]), matches);
                 }
             }
         }
         put_off.sort_by(|one, other| other.0.total_cmp(&one.0));
         for (_, parts, matches) in put_off {
-            if let Some(outcome) = self.outcome(by, parts, models) {
+            if let Some(outcome) = self.outcome(by, (parts, matches), tried, models) {
                 return Some(self.forgetting(models, parts, outcome));
             }
-            tried.fail(parts.map(|part| &self.all[part]), matches);
         }
         None
     }
@@ -306,7 +303,15 @@ impl<'a> Parts<'a> {
         }
     }
 
-    fn outcome(&mut self, by: Evidence, parts: [usize; 2], models: &ModelsOfParts<'a>) -> Option<Outcome> {
+    /// What comes of two parts that so many matches cross, which are noted as tried.
+    fn outcome(
+        &mut self,
+        by: Evidence,
+        (parts, matches): ([usize; 2], usize),
+        tried: &mut Tried,
+        models: &ModelsOfParts<'a>,
+    ) -> Option<Outcome> {
+        tried.states.insert(parts.map(|part| self.all[part].state()));
         let taken = self.taken_by_all_but(&parts);
         let mut report = std::mem::take(&mut self.report);
         let attempt = self.attempt(parts, models);
@@ -315,6 +320,9 @@ impl<'a> Parts<'a> {
             Evidence::Depths => attempt.run_hung(taken, &mut report.merges),
         };
         self.report = report;
+        if outcome.is_none() {
+            tried.fail(parts.map(|part| &self.all[part]), matches);
+        }
         outcome
     }
 
@@ -335,6 +343,7 @@ impl<'a> Parts<'a> {
 /// Which parts were tried.
 #[derive(Default)]
 struct Tried {
+    /// As they were then.
     states: BTreeSet<[PartState; 2]>,
     /// First images of two in vain, and the matches between them then.
     in_vain: Vec<([ImageId; 2], usize)>,
