@@ -80,7 +80,8 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 50: photos among stitched panoramas are stretched as windows of these are. 51: photos that their set leaves with fewer of their
 /// scene points stand as they do alone. 52: unknown focal lengths by P4Pf, too. 53: told focal lengths are asked for by the joint refinement.
 /// 54: and by photos alone; what residuals have in common makes poses uncertain.
-/// 55: photos alone that were cut from the side of a larger picture are found as such.
+/// 55: photos alone that were cut from the side of a larger picture are found as such. 56: those that may be stay doubtful at another
+/// focal length; far points end no adjustment.
 pub const VERSION: u32 = 56;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.

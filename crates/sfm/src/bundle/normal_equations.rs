@@ -21,7 +21,7 @@ use super::elimination::{Chunk, Couplings, Slot, StepSums, bounded, for_each_chu
 use super::iterative::{ImplicitSchur, IterativeSystem};
 use super::loss::LossSum;
 use super::pattern::{BlockPattern, NONE};
-use super::wide::{WidePoints, fill_by_narrow};
+use super::wide::{WidePoints, fill_by_narrow, insert_within};
 
 /// Upper bound of the chunk count; more would cost more in reductions than it gains.
 const MAX_CHUNKS: usize = 8;
@@ -618,13 +618,7 @@ fn with_fill(base: &BlockPattern, couplings: &mut Couplings, budget: &Budget) ->
     if budget.allows_wide(base) {
         return fill_by_narrow(&mut pattern, couplings, budget).then_some(pattern);
     }
-    for point in 0..couplings.free.len() {
-        if !budget.may_suffice(&pattern) {
-            return None;
-        }
-        couplings.insert(point, &mut pattern);
-    }
-    Some(pattern)
+    insert_within(budget, 0..couplings.free.len(), couplings, &mut pattern).then_some(pattern)
 }
 
 /// Solves S x = `right` in place by what is factorized.
@@ -692,6 +686,16 @@ mod tests {
         }
     }
 
+    fn drawn(rng: &mut ChaCha8Rng) -> Linearized<3> {
+        let mut draw = || rng.random_range(-1.0..1.0);
+        Linearized {
+            residual: [draw(), draw()],
+            point: [(); 2].map(|()| [(); 3].map(|()| draw())),
+            block: [(); 2].map(|()| [(); 3].map(|()| draw())),
+            extra: [(); 2].map(|()| [(); MAX_CAMERA_PARAMS].map(|()| draw())),
+        }
+    }
+
     /// Seven blocks, two further blocks of 2 and 4 scalars, fixed points, a fixed block, a point seen twice by one.
     fn example() -> (Linear, impl Fn() -> Structure) {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
@@ -701,13 +705,7 @@ mod tests {
                 let block = rng.random_range(0..8);
                 let extra = if block % 3 == 2 { NONE } else { block % 3 };
                 links.push(Link { point, block: if block == 7 { NONE } else { block }, extra });
-                let mut draw = || rng.random_range(-1.0..1.0);
-                linear.push(Linearized {
-                    residual: [draw(), draw()],
-                    point: [(); 2].map(|()| [(); 3].map(|()| draw())),
-                    block: [(); 2].map(|()| [(); 3].map(|()| draw())),
-                    extra: [(); 2].map(|()| [(); MAX_CAMERA_PARAMS].map(|()| draw())),
-                });
+                linear.push(drawn(&mut rng));
             }
         }
         let structure = move || Structure {
@@ -793,13 +791,7 @@ mod tests {
         for point in 0..5 * blocks {
             for block in seen_by(point) {
                 links.push(Link { point, block, extra: block % 2 });
-                let mut draw = || rng.random_range(-1.0..1.0);
-                linear.push(Linearized {
-                    residual: [draw(), draw()],
-                    point: [(); 2].map(|()| [(); 3].map(|()| draw())),
-                    block: [(); 2].map(|()| [(); 3].map(|()| draw())),
-                    extra: [(); 2].map(|()| [(); MAX_CAMERA_PARAMS].map(|()| draw())),
-                });
+                linear.push(drawn(&mut rng));
             }
         }
         let structure = move || Structure {

@@ -26,16 +26,10 @@ const MAX_POINTS: usize = 64;
 pub(super) fn fill_by_narrow(pattern: &mut BlockPattern, couplings: &mut Couplings, budget: &Budget) -> bool {
     let count = couplings.free.len();
     let cameras_of = |couplings: &Couplings, point: usize| couplings.of_point(point).len();
-    let mut rest: Vec<usize> = Vec::new();
-    for point in 0..count {
-        if cameras_of(couplings, point) < MIN_CAMERAS {
-            if !budget.may_suffice(pattern) {
-                return false;
-            }
-            couplings.insert(point, pattern);
-        } else {
-            rest.push(point);
-        }
+    let (few, mut rest): (Vec<usize>, Vec<usize>) =
+        (0..count).partition(|&point| cameras_of(couplings, point) < MIN_CAMERAS);
+    if !insert_within(budget, few, couplings, pattern) {
+        return false;
     }
     rest.sort_by_key(|&point| std::cmp::Reverse(cameras_of(couplings, point)));
     let is_wide = |couplings: &Couplings, point: usize| {
@@ -54,15 +48,24 @@ pub(super) fn fill_by_narrow(pattern: &mut BlockPattern, couplings: &mut Couplin
             couplings.wide[point] = true;
         }
     }
-    for point in rest {
-        if !couplings.is_wide(point) {
-            if !budget.may_suffice(pattern) {
-                return false;
-            }
+    rest.retain(|&point| !couplings.is_wide(point));
+    insert_within(budget, rest, couplings, pattern)
+}
+
+/// Adds the blocks of some points one after the other; false, and no more are, once S is beyond the budget.
+pub(super) fn insert_within(
+    budget: &Budget,
+    points: impl IntoIterator<Item = usize>,
+    couplings: &Couplings,
+    pattern: &mut BlockPattern,
+) -> bool {
+    points.into_iter().all(|point| {
+        let fits = budget.may_suffice(pattern);
+        if fits {
             couplings.insert(point, pattern);
         }
-    }
-    true
+        fits
+    })
 }
 
 /// What wide points add to a factorized S₀.

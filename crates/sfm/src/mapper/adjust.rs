@@ -51,10 +51,7 @@ impl Scope {
     ///
     /// What a join at one end of a place does to the other end is for the adjustment of the finished whole.
     pub fn about(model: &Model<'_>, images: &[ImageId]) -> Self {
-        let mut shared = vec![0_usize; model.poses.len()];
-        for point in model.seen_by(images).into_iter().filter_map(|id| model.point(id)) {
-            point.track.iter().for_each(|seen| shared[seen.image.index()] += 1);
-        }
+        let shared = views_of(model, model.seen_by(images));
         let is_near =
             |image: &ImageId| images.contains(image) || shared[image.index()] >= MIN_ADJUSTABLE_POINTS;
         let free_images: Vec<ImageId> = model.registered().filter(is_near).collect();
@@ -68,12 +65,7 @@ impl Scope {
     /// `image` and the `neighbours` images that share most points with it, with all points that any of them sees: what a
     /// neighbour sees beside the image holds it, too.
     pub fn local(model: &Model<'_>, image: ImageId, neighbours: usize) -> Self {
-        let mut shared = vec![0_usize; model.poses.len()];
-        for (_, id) in model.observations_of(image) {
-            for seen in model.point(id).into_iter().flat_map(|point| &point.track) {
-                shared[seen.image.index()] += 1;
-            }
-        }
+        let shared = views_of(model, model.observations_of(image).into_iter().map(|(_, id)| id));
         let mut others: Vec<ImageId> =
             model.registered().filter(|&other| other != image && shared[other.index()] > 0).collect();
         others.sort_by_key(|other| (std::cmp::Reverse(shared[other.index()]), *other));
@@ -82,6 +74,15 @@ impl Scope {
         let points = model.seen_by(&others);
         Self { free_images: others, points, intrinsics: Intrinsics::None }
     }
+}
+
+/// How often each image sees some points.
+fn views_of(model: &Model<'_>, points: impl IntoIterator<Item = PointId>) -> Vec<usize> {
+    let mut views = vec![0; model.poses.len()];
+    for seen in points.into_iter().filter_map(|id| model.point(id)).flat_map(|point| &point.track) {
+        views[seen.image.index()] += 1;
+    }
+    views
 }
 
 /// Observations that are worth handing to another thread.
