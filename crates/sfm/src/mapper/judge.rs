@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use super::{
     Mapper, RegistrationRecord,
     depths::{Floor, floor_of_all, stands_on_floor},
-    latecomers::{hypothesize_from_crossings, hypothesize_from_depths},
+    latecomers::{hypothesize_from_crossings, hypothesize_from_depths, lead_elsewhere},
     neighbours::{Neighbours, neighbours, share_as_neighbours, share_with_one},
     register::{PoseHypothesis, Visibility, hypothesize, hypothesize_from_pairs, visibility},
     support::{Support, Worth},
@@ -15,6 +15,12 @@ use crate::{ImageId, PointId, Rigid, robust::RansacParams};
 
 /// Share of a pair's matches on the epipolar circles of a pose that make it agree with that pose.
 const MIN_ON_CIRCLES: f64 = 0.9;
+
+/// How many times more matches the strongest pair of an image must have with one outside the model than with one inside for
+/// it to be of another place, unless most of its matches agree on this one.
+const ELSEWHERE_LEAD: f64 = 4.0;
+/// Share of the 2D-to-3D matches of an image that agree on its pose where nothing speaks for another place.
+const MOST_MATCHES: f64 = 0.5;
 
 /// Who judges poses in a model, and what is known of all of it for that: counted when something asks, and then kept, as nothing
 /// changes the model meanwhile.
@@ -97,6 +103,7 @@ impl Judge<'_, '_> {
             };
             let accepted = plausible
                 && !is_contradicted
+                && !self.is_of_elsewhere(image, &hypothesis)
                 && self.mapper.pair_agreement(image, &hypothesis.world_from_camera)
                     >= params.min_pair_agreement;
             let (candidates, inliers) = (hypothesis.candidates, hypothesis.inliers.len());
@@ -106,6 +113,20 @@ impl Judge<'_, '_> {
             }
         }
         None
+    }
+
+    /// Whether an image is of a place that is not mapped here, by its pairs, and looks like several places that are.
+    ///
+    /// The crossings of a town look alike: of 1200 panoramas 22 were taken for other crossings, before any that they stand next
+    /// to was mapped, and tore the whole apart by what they share with those. A fifth to two fifths of their 2D-to-3D matches agreed on
+    /// one place (median and most), and their strongest pairs were with others at 5 m, by 5 to 10 times. Where a model has just begun,
+    /// right images may lead elsewhere by as much; of their matches six to nine in ten agreed.
+    fn is_of_elsewhere(&self, image: ImageId, hypothesis: &PoseHypothesis) -> bool {
+        let model = &self.mapper.model;
+        let is_minority = (hypothesis.inliers.len() as f64) < MOST_MATCHES * hypothesis.candidates as f64;
+        is_minority
+            && lead_elsewhere(model.pairs_of(image), image, |other| model.is_registered(other))
+                >= ELSEWHERE_LEAD
     }
 
     /// Whether an image may come in late at a pose.
@@ -269,7 +290,9 @@ mod tests {
     use setloc_features::{Camera, ImageFeatures, Keypoint};
 
     use super::*;
-    use crate::mapper::{MapperInput, MapperParams, Model, wall};
+    use crate::mapper::{
+        MapperInput, MapperParams, Model, test_street::Street, test_street::first_two, wall,
+    };
     use crate::{PairGeometry, TwoView, synthetic::seeded};
 
     /// Points of one wall fit two rotations, and verification may have taken the other one.
@@ -316,5 +339,30 @@ mod tests {
         let askew = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.2);
         let askew = Rigid::new(askew * poses[1].rotation, poses[1].translation);
         assert_eq!(mapper.pair_agreement(ImageId(1), &askew), 0.0);
+    }
+
+    #[test]
+    fn who_looks_like_several_places_waits_for_the_one_that_its_strongest_pair_is_with() {
+        // The third panorama shares 20 points with each of the first two, and all with a fourth.
+        let mut street = Street::new("elsewhere", 20, 20);
+        street.stand_again(2);
+        let input = street.input();
+        let params = MapperParams::default();
+        let image = ImageId(2);
+        let accepts = |with_fourth: bool, agreeing: usize| {
+            let mut model = first_two(&street, &input);
+            if with_fourth {
+                model.set_pose(ImageId(3), Some(street.poses[3]));
+            }
+            let mapper = Mapper::over(&params, model, vec![false; 4], 0);
+            let sigmas = params.max_error_sigma;
+            let mut pose = PoseHypothesis::at(&mapper.model, &mapper.graph, image, street.poses[2], sigmas);
+            assert!(pose.candidates >= 15, "{} candidates", pose.candidates);
+            pose.inliers.truncate(pose.candidates * agreeing / 10);
+            mapper.judge().first_accepted(image, vec![pose], &mut false, &mut Vec::new()).is_some()
+        };
+        assert!(!accepts(false, 3), "a third of its matches agree");
+        assert!(accepts(false, 7), "most agree");
+        assert!(accepts(true, 3), "what it belongs to is mapped");
     }
 }

@@ -34,7 +34,7 @@ use crate::{
 pub(super) const FEW_IMAGES: usize = 3;
 /// How many times more matches the strongest pair of an image of a part must have with an image elsewhere than the strongest
 /// within for it to belong there.
-const ELSEWHERE_LEAD: usize = 2;
+const ELSEWHERE_LEAD: f64 = 2.0;
 /// Pairs of an image, the strongest, whose directions are crossed with each other.
 const CROSSED_PAIRS: usize = 12;
 /// Largest difference between the rotations that two pairs give, and between a direction and the place that two cross in.
@@ -59,15 +59,24 @@ pub(super) fn belongs_elsewhere<'p>(
     part: &Part,
     image: ImageId,
 ) -> bool {
+    let is_within = |other: ImageId| part.component.images[other.index()].world_from_camera.is_some();
+    lead_elsewhere(pairs, image, is_within) >= ELSEWHERE_LEAD
+}
+
+/// How many times more matches the strongest pair of an image has with one that is not within than with one that is.
+pub(super) fn lead_elsewhere<'p>(
+    pairs: impl Iterator<Item = &'p PairGeometry>,
+    image: ImageId,
+    is_within: impl Fn(ImageId) -> bool,
+) -> f64 {
     let mut strongest = [0; 2];
     for pair in pairs {
         let Some((other, _)) = pair.seen_from(image) else { continue };
-        let is_within = part.component.images[other.index()].world_from_camera.is_some();
-        let most = &mut strongest[usize::from(is_within)];
+        let most = &mut strongest[usize::from(is_within(other))];
         *most = pair.two_view.inliers.len().max(*most);
     }
-    let [elsewhere, within] = strongest;
-    elsewhere >= ELSEWHERE_LEAD * within
+    let [elsewhere, within] = strongest.map(|most| most as f64);
+    elsewhere / within
 }
 
 /// A verified pair of the image that is sought and a registered one.

@@ -11,9 +11,11 @@
 mod crossing;
 mod hung;
 mod likeness;
+mod local;
 mod similarity;
 
 use std::{
+    cmp::Reverse,
     collections::{BTreeMap, BTreeSet},
     sync::OnceLock,
 };
@@ -34,7 +36,7 @@ use super::{
     depths::is_indoors,
     latecomers::belongs_elsewhere,
     model::Model,
-    neighbours::{Neighbours, neighbours, share_as_neighbours},
+    neighbours::{Neighbours, are_strangers, neighbours, share_as_neighbours},
     parts::{Part, Parts},
     register::{Visibility, visibility, visibility_beside},
     structure::{complete_and_merge, connect},
@@ -60,6 +62,8 @@ pub enum MergeVerdict {
     NotRecognized,
     /// The rotations of verified pairs disagree.
     PairsDisagree,
+    /// Images that come to stand next to each other share next to nothing.
+    Strangers,
     /// The measured positions disagree.
     PositionsDisagree,
     /// Two different similarities are as good.
@@ -146,10 +150,6 @@ impl MergeRecord {
 const MIN_GROWTH: f64 = 1.1;
 /// Fewest matches of a similarity that more are sought for.
 const MIN_SEED: usize = 6;
-/// Pairs of images about which similarities are sought where all matches together give none, and images of either
-/// component about each of a pair.
-const LOCAL_PAIRS: usize = 5;
-const LOCAL_IMAGES: usize = 3;
 /// Half widths of the bands about the epipolar circles in which they are sought, one after the other.
 const GUIDED_BANDS_RAD: [f64; 3] = [0.02, 0.008, 0.004];
 /// Matches of an image that make it count for the scale between two components: one more than its pose needs.
@@ -160,6 +160,8 @@ const MAX_LOG_SCALE_SIGMA: f64 = 0.05;
 const MIN_EXPECTED_MATCHES: f64 = 10.0;
 /// Smallest share of the matches expected by likeness.
 const MIN_LIKENESS: f64 = 0.3;
+/// Share from which two parts are of one place whatever images that come to stand next to each other share.
+const CLEAR_LIKENESS: f64 = 0.5;
 /// The same where most pairs across have the rotation that the similarity gives them.
 const MIN_LIKENESS_OF_PAIRS: f64 = 0.2;
 /// Share of the verified matches across that are of such pairs where these are most.
@@ -189,7 +191,7 @@ const UNFIT_ONE_IN: usize = 8;
 const MIN_KEPT_OBSERVATIONS: f64 = 0.9;
 
 impl<'a> Parts<'a> {
-    /// Joins parts, largest first, as long as a similarity between two of them is supported.
+    /// Joins parts as long as a similarity between two of them is supported.
     ///
     /// A whole is finished when nothing more joins it: that takes far longer than all else about a join.
     pub fn join_supported(&mut self) {
@@ -254,30 +256,24 @@ impl<'a> Parts<'a> {
             models.entry(part.first()).or_default();
         }
         let mut put_off = Vec::new();
-        for kept in 0..self.all.len() {
-            let larger = &self.all[kept];
+        for parts in self.two_by_two(by) {
+            let [larger, smaller] = parts.map(|part| &self.all[part]);
             let is_outdoors = || !is_indoors(models[&larger.first()].model(self.input, larger));
-            if matches!(by, Evidence::Depths) && is_outdoors() {
+            let is_tried = tried.states.contains(&[larger.state(), smaller.state()]);
+            if is_tried || matches!(by, Evidence::Depths) && is_outdoors() {
                 continue;
             }
-            for moved in kept + 1..self.all.len() {
-                let parts = [kept, moved];
-                let [larger, smaller] = parts.map(|part| &self.all[part]);
-                if tried.states.contains(&[larger.state(), smaller.state()]) {
-                    continue;
+            let (matches, growth) = match by {
+                Evidence::Matches => {
+                    let matches = self.attempt(parts, models).sides.crossings().len();
+                    (matches, tried.growth([larger, smaller], matches))
                 }
-                let (matches, growth) = match by {
-                    Evidence::Matches => {
-                        let matches = self.attempt(parts, models).sides.crossings().len();
-                        (matches, tried.growth([larger, smaller], matches))
-                    }
-                    Evidence::Depths => (0, f64::INFINITY),
-                };
-                if growth < MIN_GROWTH {
-                    put_off.push((growth, parts, matches));
-                } else if let Some(outcome) = self.outcome(by, (parts, matches), tried, models) {
-                    return Some(self.forgetting(models, parts, outcome));
-                }
+                Evidence::Depths => (0, f64::INFINITY),
+            };
+            if growth < MIN_GROWTH {
+                put_off.push((growth, parts, matches));
+            } else if let Some(outcome) = self.outcome(by, (parts, matches), tried, models) {
+                return Some(self.forgetting(models, parts, outcome));
             }
         }
         put_off.sort_by(|one, other| other.0.total_cmp(&one.0));
@@ -287,6 +283,33 @@ impl<'a> Parts<'a> {
             }
         }
         None
+    }
+
+    /// All parts two by two, the larger of each first.
+    ///
+    /// Those that one verified pair has most matches between come first, and of others the larger: where a wrong place and the
+    /// right one both pass, the whole that the right one makes leaves no room for the wrong.
+    fn two_by_two(&self, by: Evidence) -> Vec<[usize; 2]> {
+        let count = self.all.len();
+        let mut two: Vec<[usize; 2]> =
+            (0..count).flat_map(|kept| (kept + 1..count).map(move |moved| [kept, moved])).collect();
+        if matches!(by, Evidence::Matches) {
+            let mut part_of = vec![None; self.input.images.len()];
+            for (at, part) in self.all.iter().enumerate() {
+                part.component.registered().for_each(|image| part_of[image.index()] = Some(at));
+            }
+            let mut strongest = BTreeMap::new();
+            for pair in self.input.pairs {
+                let [Some(one), Some(other)] = [pair.first, pair.second].map(|image| part_of[image.index()])
+                else {
+                    continue;
+                };
+                let most: &mut usize = strongest.entry([one.min(other), one.max(other)]).or_default();
+                *most = pair.two_view.inliers.len().max(*most);
+            }
+            two.sort_by_key(|parts| Reverse(strongest.get(parts).copied().unwrap_or(0)));
+        }
+        two
     }
 
     fn attempt<'p>(&'p self, parts: [usize; 2], models: &'p ModelsOfParts<'a>) -> Attempt<'p, 'p, 'a> {
@@ -437,18 +460,35 @@ impl<'a> Attempt<'_, '_, 'a> {
             return None;
         }
         let mut hypotheses = self.hypotheses(&crossings);
+        let mut local =
+            self.local_similarities(&crossings).into_iter().map(|local| self.hypothesis(&crossings, local));
+        // About the strongest pair in any case.
+        hypotheses.splice(0..0, local.next());
         let mut judged: Vec<Result<Recognition, MergeVerdict>> =
             hypotheses.iter().map(|hypothesis| self.judge(&crossings, hypothesis)).collect();
         if !judged.iter().any(Result::is_ok)
-            && let Some(local) = self.local_hypothesis(&crossings)
+            && let Some(local) = local.next()
         {
             judged.push(self.judge(&crossings, &local));
             hypotheses.push(local);
         }
-        let mut fit = judged.iter().enumerate().filter(|(_, judged)| judged.is_ok());
-        let first = fit.next().map(|(at, _)| at);
-        let rival =
-            fit.any(|(at, _)| first.is_some_and(|first| self.differ(&hypotheses[first], &hypotheses[at])));
+        let mut fit: Vec<usize> = (0..judged.len()).filter(|at| judged[*at].is_ok()).collect();
+        let has_rival = |fit: &[usize]| {
+            let others = fit.iter().skip(1);
+            others.copied().any(|other| self.differ(&hypotheses[fit[0]], &hypotheses[other]))
+        };
+        if has_rival(&fit) {
+            let brings_together = |hypothesis: &Hypothesis| {
+                self.share_as_neighbours(|image| self.pose_in_kept(image, &hypothesis.kept_from_moved))
+            };
+            let together: Vec<usize> =
+                fit.iter().copied().filter(|at| brings_together(&hypotheses[*at])).collect();
+            if !together.is_empty() {
+                fit = together;
+            }
+        }
+        let rival = has_rival(&fit);
+        let first = fit.first().copied();
         let mut joined = None;
         let best = first.unwrap_or(0);
         if first.is_some() {
@@ -521,46 +561,6 @@ impl<'a> Attempt<'_, '_, 'a> {
             found.push(hypothesis);
         }
         found
-    }
-
-    /// The best similarity that is found about single pairs, those with most verified matches.
-    ///
-    /// Of long parts that meet at one corner, a few images share a hundred matches, and all others match repeated
-    /// façades: random samples of all that crosses hardly ever consist of right ones (a twentieth of 3000).
-    fn local_hypothesis(&self, crossings: &[Crossing]) -> Option<Hypothesis> {
-        let ransac = self.ransac();
-        let mut counts: BTreeMap<[ImageId; 2], usize> = BTreeMap::new();
-        for crossing in crossings.iter().filter(|crossing| crossing.verified) {
-            *counts.entry([crossing.kept.image, crossing.moved.image]).or_default() += 1;
-        }
-        let mut pairs: Vec<[ImageId; 2]> = counts.keys().copied().collect();
-        pairs.sort_by_key(|pair| std::cmp::Reverse(counts[pair]));
-        pairs.truncate(LOCAL_PAIRS);
-        let about = |model: &Model<'_>, image: ImageId| -> Vec<ImageId> {
-            let center = |image: ImageId| model.poses[image.index()].map(|pose| *pose.center());
-            let Some(here) = center(image) else { return Vec::new() };
-            let distance = |image: &ImageId| center(*image).map_or(f64::INFINITY, |at| (at - here).norm());
-            let mut near: Vec<ImageId> = model.registered().collect();
-            near.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
-            near.truncate(LOCAL_IMAGES);
-            near
-        };
-        let seek = |[kept, moved]: [ImageId; 2]| {
-            let (kept, moved) = (about(self.sides.kept, kept), about(self.sides.moved, moved));
-            let near: Vec<Crossing> = crossings
-                .iter()
-                .filter(|crossing| {
-                    kept.contains(&crossing.kept.image) && moved.contains(&crossing.moved.image)
-                })
-                .copied()
-                .collect();
-            let candidates = Sights::collect(&self.sides, near.iter()).estimate(&ransac, self.seed);
-            let (_, best) = self.best_of(&near, candidates)?;
-            Some((self.sides.score(crossings, &best, self.params.max_error_sigma), best))
-        };
-        let found: Vec<(f64, Similarity)> = pairs.into_par_iter().with_max_len(1).filter_map(seek).collect();
-        let best = found.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
-        best.map(|(_, best)| self.hypothesis(crossings, best))
     }
 
     /// The candidate that explains the matches best, refined, with its score.
@@ -655,7 +655,7 @@ impl<'a> Attempt<'_, '_, 'a> {
     /// What tells that the two are of one place, or why they are not joined.
     fn judge(&self, crossings: &[Crossing], hypothesis: &Hypothesis) -> Result<Recognition, MergeVerdict> {
         let params = self.params;
-        let Hypothesis { kept_from_moved, agreeing, support, .. } = hypothesis;
+        let Hypothesis { kept_from_moved, agreeing, support, likeness, .. } = hypothesis;
         if *support < params.min_registration_inliers {
             return Err(MergeVerdict::Unsupported);
         }
@@ -667,6 +667,11 @@ impl<'a> Attempt<'_, '_, 'a> {
         let recognition = self.recognition(crossings, hypothesis).ok_or(MergeVerdict::NotRecognized)?;
         if self.pair_agreement(kept_from_moved) < params.min_pair_agreement {
             return Err(MergeVerdict::PairsDisagree);
+        }
+        let is_faint =
+            recognition == Recognition::Likeness && likeness.matched < CLEAR_LIKENESS * likeness.expected;
+        if is_faint && self.are_strangers(kept_from_moved) {
+            return Err(MergeVerdict::Strangers);
         }
         if self.positions_disagree(kept_from_moved) {
             return Err(MergeVerdict::PositionsDisagree);
@@ -717,18 +722,30 @@ impl<'a> Attempt<'_, '_, 'a> {
 
     /// Whether images of the two that stand as near as neighbours, by these poses, share what neighbours within either do.
     fn share_as_neighbours(&self, pose: impl Fn(ImageId) -> Option<Rigid> + Sync) -> bool {
+        let [known, asked] = self.neighbours(pose);
+        share_as_neighbours(&known, &asked)
+    }
+
+    /// Whether images of the two stand as near as neighbours, in the open, and share next to nothing.
+    fn are_strangers(&self, kept_from_moved: &Similarity) -> bool {
+        let Sides { kept, moved } = self.sides;
+        let [known, asked] = self.neighbours(|image| self.pose_in_kept(image, kept_from_moved));
+        are_strangers(&known, &asked) && !is_indoors(kept) && !is_indoors(moved)
+    }
+
+    /// The pairs of images within either of the two, and those across, at these poses.
+    fn neighbours(&self, pose: impl Fn(ImageId) -> Option<Rigid> + Sync) -> [Vec<Neighbours>; 2] {
         let Sides { kept, moved } = self.sides;
         let placed = |image: ImageId| {
             let side = if kept.is_registered(image) { kept } else { moved };
             pose(image).filter(|_| side.is_registered(image)).map(|pose| (pose, &side.rays[image.index()]))
         };
         let pairs = neighbours(kept.input, placed, |_, _| true, self.params.max_error_sigma);
-        let crosses = |pair: &Neighbours| {
+        let is_within = |pair: &Neighbours| {
             let [first, second] = pair.images.map(|image| kept.is_registered(image));
-            first != second
+            first == second
         };
-        let (asked, known): (Vec<_>, Vec<_>) = pairs.into_iter().partition(crosses);
-        share_as_neighbours(&known, &asked)
+        pairs.into_iter().partition::<Vec<_>, _>(is_within).into()
     }
 
     /// The pose of an image of either in the frame of the larger.

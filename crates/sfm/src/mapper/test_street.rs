@@ -81,7 +81,11 @@ impl Street {
     }
 
     pub fn graph(&self) -> CorrespondenceGraph {
-        CorrespondenceGraph::build(&[POINTS; 3], &self.pairs, &vec![true; self.pairs.len()])
+        CorrespondenceGraph::build(
+            &vec![POINTS; self.features.len()],
+            &self.pairs,
+            &vec![true; self.pairs.len()],
+        )
     }
 
     pub fn features_mut(&mut self, image: usize) -> &mut ImageFeatures {

@@ -12,7 +12,8 @@ use super::{
         structure::{complete_and_merge, triangulate_image},
         support::{Support, Worth},
     },
-    Attempt, LOCAL_PAIRS, MergeRecord, MergeVerdict, Part,
+    Attempt, MergeRecord, MergeVerdict, Part,
+    local::LOCAL_PAIRS,
 };
 use crate::{BaselineLength, ImageId, PairGeometry, Similarity, TwoViewKind};
 
