@@ -32,10 +32,10 @@ use self::{
 };
 use super::{
     Mapper, MapperInput, MapperParams, MapperReport,
-    adjust::Scope,
+    adjust::{MIN_ADJUSTABLE_POINTS, Scope},
     depths::is_indoors,
     latecomers::belongs_elsewhere,
-    model::Model,
+    model::{Model, ModelPoint},
     neighbours::{Neighbours, are_strangers, neighbours, share_as_neighbours},
     parts::{Part, Parts},
     register::{Visibility, visibility, visibility_beside},
@@ -160,6 +160,8 @@ const MAX_LOG_SCALE_SIGMA: f64 = 0.05;
 const MIN_EXPECTED_MATCHES: f64 = 10.0;
 /// Smallest share of the matches expected by likeness.
 const MIN_LIKENESS: f64 = 0.3;
+/// Images of a part of which only those at the seam are adjusted before a join is judged.
+const LARGE_PART: usize = 100;
 /// Share from which two parts are of one place whatever images that come to stand next to each other share.
 const CLEAR_LIKENESS: f64 = 0.5;
 /// The same where most pairs across have the rotation that the similarity gives them.
@@ -857,7 +859,7 @@ impl<'a> Attempt<'_, '_, 'a> {
     ///
     /// Of a large component that meets a small one only what is about the seam is adjusted, if that contradicts nothing.
     fn join(&self, hypothesis: &Hypothesis, taken: &[bool]) -> Option<Mapper<'a>> {
-        let about_seam = |model: &Model<'a>| Scope::about(model, &self.moved_images());
+        let about_seam = |model: &Model<'a>| Scope::about(model, &self.at_seam(model));
         let (mapper, is_partial) = self.adjusted(hypothesis, taken, about_seam);
         let mut mapper = if self.holds(&mapper, hypothesis) {
             mapper
@@ -903,8 +905,23 @@ impl<'a> Attempt<'_, '_, 'a> {
         (mapper, is_partial)
     }
 
-    fn moved_images(&self) -> Vec<ImageId> {
-        self.moved.component.registered().collect()
+    /// The images that a join moves most: those of the part that is moved, or, where that is large, those of either part that see
+    /// what holds them together.
+    fn at_seam(&self, model: &Model<'_>) -> Vec<ImageId> {
+        if self.moved.size() < LARGE_PART {
+            return self.moved.component.registered().collect();
+        }
+        let mut ties = vec![0; model.poses.len()];
+        for (_, point) in model.live_points().filter(|(_, point)| self.is_tie(point)) {
+            point.track.iter().for_each(|seen| ties[seen.image.index()] += 1);
+        }
+        model.registered().filter(|image| ties[image.index()] >= MIN_ADJUSTABLE_POINTS).collect()
+    }
+
+    /// Whether images of both parts see a point.
+    fn is_tie(&self, point: &ModelPoint) -> bool {
+        let Sides { kept, moved } = self.sides;
+        [kept, moved].iter().all(|side| point.track.iter().any(|seen| side.is_registered(seen.image)))
     }
 
     /// The model of both, that images may join but those that are taken.
@@ -955,12 +972,7 @@ impl<'a> Attempt<'_, '_, 'a> {
     fn holds(&self, mapper: &Mapper<'_>, hypothesis: &Hypothesis) -> bool {
         let model = &mapper.model;
         let sides = [self.sides.kept, self.sides.moved];
-        let ties = model
-            .live_points()
-            .filter(|(_, point)| {
-                sides.iter().all(|side| point.track.iter().any(|seen| side.is_registered(seen.image)))
-            })
-            .count();
+        let ties = model.live_points().filter(|(_, point)| self.is_tie(point)).count();
         let recognizes = |of: &Model<'_>, at: &Model<'_>| {
             let seen: Visibility = of
                 .registered()
