@@ -291,7 +291,9 @@ mod tests {
 
     use super::*;
     use crate::mapper::{
-        MapperInput, MapperParams, Model, test_street::Street, test_street::first_two, wall,
+        MapperInput, MapperParams, Model,
+        test_street::{Street, first_two},
+        wall,
     };
     use crate::{PairGeometry, TwoView, synthetic::seeded};
 

@@ -44,6 +44,13 @@ impl<'a> Sides<'_, 'a> {
         once(found)
     }
 
+    /// The kept and the moved one of two images, where they are one of either.
+    pub fn ends(&self, first: ImageId, second: ImageId) -> Option<(ImageId, ImageId)> {
+        [(first, second), (second, first)]
+            .into_iter()
+            .find(|(kept, moved)| self.kept.is_registered(*kept) && self.moved.is_registered(*moved))
+    }
+
     fn collect(
         &self,
         first: ImageId,
@@ -52,13 +59,8 @@ impl<'a> Sides<'_, 'a> {
         verified: bool,
         found: &mut Vec<Crossing>,
     ) {
-        let (kept, moved, swapped) = if self.kept.is_registered(first) && self.moved.is_registered(second) {
-            (first, second, false)
-        } else if self.kept.is_registered(second) && self.moved.is_registered(first) {
-            (second, first, true)
-        } else {
-            return;
-        };
+        let Some((kept, moved)) = self.ends(first, second) else { return };
+        let swapped = kept != first;
         let has_ray = |model: &Model<'_>, seen: Observation| {
             let sigma = model.rays[seen.image.index()].sigmas.get(seen.feature as usize);
             sigma.is_some_and(|sigma| sigma.is_finite())

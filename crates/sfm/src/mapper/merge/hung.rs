@@ -112,12 +112,9 @@ impl<'a> Attempt<'_, '_, 'a> {
         self.sides.moved.registered().filter(is_stranger).collect()
     }
 
-    /// Whether one of the images of a pair is in either part.
+    /// Whether a pair is of an image of either part.
     fn crosses(&self, pair: &PairGeometry) -> bool {
-        let is_in = |model: &Model<'_>| {
-            [pair.first, pair.second].into_iter().filter(|image| model.is_registered(*image)).count() == 1
-        };
-        is_in(self.sides.kept) && is_in(self.sides.moved)
+        self.sides.ends(pair.first, pair.second).is_some()
     }
 
     /// The similarity by a pair across, with its length in both parts, below whose images these floors are.

@@ -81,12 +81,8 @@ impl Attempt<'_, '_, '_> {
 
     /// The [`LOCAL_PAIRS`] verified pairs across with most matches.
     fn strongest_across<'p>(&self, pairs: &'p [PairGeometry]) -> Vec<Across<'p>> {
-        let [kept, moved] = [self.sides.kept, self.sides.moved];
         let across = |pair: &'p PairGeometry| {
-            let (first, second) = (pair.first, pair.second);
-            let (kept, moved) = [(first, second), (second, first)]
-                .into_iter()
-                .find(|(one, other)| kept.is_registered(*one) && moved.is_registered(*other))?;
+            let (kept, moved) = self.sides.ends(pair.first, pair.second)?;
             let (_, moved_from_kept) = pair.seen_from(moved)?;
             Some(Across { pair, kept, moved, moved_from_kept })
         };
