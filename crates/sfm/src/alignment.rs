@@ -39,7 +39,7 @@ use crate::{
 pub(crate) const STITCHING_OF_EACH: f64 = 0.0005;
 
 /// Bumped when equal inputs and parameters give another result.
-pub const ALIGNMENT_VERSION: u32 = 27;
+pub const ALIGNMENT_VERSION: u32 = 28;
 
 /// Cosine between a patch's normal and the steepest view in which it is sought without a keypoint.
 const MIN_COSINE: f64 = 0.5;

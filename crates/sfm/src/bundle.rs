@@ -7,7 +7,7 @@
 //! its place of the image.
 //!
 //! Levenberg–Marquardt with analytic Jacobians; points are eliminated (Schur complement) and the reduced camera system
-//! is factorized by Cholesky, dense or sparse, or, when it does not fit, solved by conjugate gradients without being
+//! is factorized by Cholesky, dense or sparse, or, when that takes too long, solved by conjugate gradients without being
 //! formed ([`LinearSolver`]). Robust losses act by first-order reweighting (ρ′ on residual and
 //! Jacobian; the second-order term of Triggs' correction is left out, as it makes the model indefinite).
 //!
@@ -32,7 +32,7 @@ mod problem;
 mod residual;
 mod response;
 mod spherical;
-mod wide;
+mod split;
 
 use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
@@ -58,13 +58,13 @@ const SINGULAR_SHARE: f64 = 1e-13;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LinearSolver {
-    /// By Cholesky while S and its factor take at most 2 GiB and about the time of conjugate gradients, else by these.
-    /// Up to 500 free poses that is always Cholesky.
+    /// By Cholesky while S and its factor take at most 2 GiB and no longer than what else there is to a step, else by conjugate
+    /// gradients. Up to 300 free poses that is always Cholesky.
     #[default]
     Auto,
     /// By Cholesky of S, dense or sparse, unless that takes more than 32 GiB.
     Direct,
-    /// By preconditioned conjugate gradients to a relative residual of 0.1; S is never formed.
+    /// By conjugate gradients to a relative residual of 0.01, preconditioned by what S is where points are split; S is never formed.
     Iterative,
 }
 

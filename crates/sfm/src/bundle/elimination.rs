@@ -25,38 +25,53 @@ pub(super) struct Slot {
 pub(super) struct Couplings {
     /// First slot of each point, and the end.
     pub starts: Vec<usize>,
-    /// Ascending by block within a point; none where the point is fixed.
+    /// Ascending by block within a point, or within a copy of one; none where the point is fixed.
     pub slots: Vec<Slot>,
     /// Whether each point is an unknown.
     pub free: Vec<bool>,
-    /// Whether each point is kept out of S; empty where none is.
-    pub wide: Vec<bool>,
+    /// [Copies](super::split) of the points, where S stays implicit.
+    pub copies: Option<Copies>,
+}
+
+/// Consecutive slots of each point, one copy after the other.
+#[derive(Debug)]
+pub(super) struct Copies {
+    /// First copy of each point, and the end.
+    pub starts: Vec<usize>,
+    /// First slot of each copy, and the end.
+    pub slot_starts: Vec<usize>,
+}
+
+impl Copies {
+    pub fn count(&self) -> usize {
+        self.slot_starts.len() - 1
+    }
+
+    /// Copies of some points.
+    pub fn of_points(&self, points: &Range<usize>) -> Range<usize> {
+        self.starts[points.start]..self.starts[points.end]
+    }
+
+    /// Slots of a copy, ascending by block.
+    #[inline]
+    pub fn slots(&self, copy: usize) -> Range<usize> {
+        self.slot_starts[copy]..self.slot_starts[copy + 1]
+    }
 }
 
 impl Couplings {
     #[inline]
-    pub fn is_wide(&self, point: usize) -> bool {
-        !self.wide.is_empty() && self.wide[point]
-    }
-
-    /// Blocks of S that a point has a share in: row and column, column ≤ row.
-    pub fn for_each_pair(&self, point: usize, mut take: impl FnMut(usize, usize)) {
-        let of_point = self.of_point(point);
-        for (index, row) in of_point.iter().enumerate() {
-            for column in &of_point[..=index] {
-                take(row.block as usize, column.block as usize);
-            }
-        }
-    }
-
-    /// Adds these blocks.
-    pub fn insert(&self, point: usize, pattern: &mut BlockPattern) {
-        self.for_each_pair(point, |row, column| pattern.insert(row, column));
-    }
-
-    #[inline]
     pub fn of_point(&self, point: usize) -> &[Slot] {
         &self.slots[self.starts[point]..self.starts[point + 1]]
+    }
+}
+
+/// Adds the blocks of all pairs of some slots, ascending by block.
+pub(super) fn insert_pairs(slots: &[Slot], pattern: &mut BlockPattern) {
+    for (index, row) in slots.iter().enumerate() {
+        for column in &slots[..=index] {
+            pattern.insert(row.block as usize, column.block as usize);
+        }
     }
 }
 
@@ -69,14 +84,14 @@ pub(super) struct Chunk {
     /// V of each point: lower triangle by rows.
     pub point_hessian: Vec<[f64; 6]>,
     pub point_gradient: Vec<[f64; 3]>,
-    /// [`point_factor`] of each point when S stays implicit, else empty.
+    /// V of each copy of points.
+    pub copy_hessian: Vec<[f64; 6]>,
+    /// [`point_factor`] of each point where there are copies, else empty.
     pub factors: Vec<[f64; 6]>,
     pub base: Vec<f64>,
     pub gradient: Vec<f64>,
-    /// −W V⁻¹ Wᵀ in the blocks of the pattern; of an implicit S its diagonal blocks alone.
+    /// −W V⁻¹ Wᵀ in the blocks of the pattern, of copies where there are any.
     pub schur: Vec<f64>,
-    /// Columns of W V⁻¹ᐟ² of each slot of wide points.
-    pub wide: Vec<f64>,
     /// W V⁻¹ times g_p, or times Wᵀx.
     pub reduced: Vec<f64>,
     pub scratch: Vec<f64>,
@@ -106,10 +121,8 @@ impl Chunk {
     /// Subtracts W V⁻¹ Wᵀ from S and adds up W V⁻¹ g_p, for damping λ.
     pub fn eliminate<const D: usize>(&mut self, lambda: f64, couplings: &Couplings, pattern: &BlockPattern) {
         self.schur.fill(0.0);
-        self.wide.clear();
         self.reduced.fill(0.0);
         self.usable = true;
-        let is_implicit = !self.factors.is_empty();
         for (index, point) in self.points.clone().enumerate() {
             let of_point = couplings.of_point(point);
             if of_point.is_empty() {
@@ -119,51 +132,71 @@ impl Chunk {
                 self.usable = false;
                 continue;
             };
-            if is_implicit {
-                self.factors[index] = factor;
-            }
-            let [i00, l10, i11, l20, l21, i22] = factor;
+            self.scale_couplings(of_point, &factor, pattern);
             let [z0, z1, z2] = forward(&factor, self.point_gradient[index]);
             let first = of_point[0].offset as usize;
             for slot in of_point {
-                let dim = pattern.dim(slot.block as usize);
-                let w = &self.coupling[slot.offset as usize..][..3 * dim];
-                let y = &mut self.scratch[slot.offset as usize - first..][..3 * dim];
-                let start = pattern.start(slot.block as usize);
-                let reduced = &mut self.reduced[start..start + dim];
-                for row in 0..dim {
-                    let y0 = w[row] * i00;
-                    let y1 = (w[dim + row] - l10 * y0) * i11;
-                    let y2 = (w[2 * dim + row] - l20 * y0 - l21 * y1) * i22;
-                    (y[row], y[dim + row], y[2 * dim + row]) = (y0, y1, y2);
-                    reduced[row] += y0 * z0 + y1 * z1 + y2 * z2;
-                }
+                let (dim, start) = (pattern.dim(slot.block as usize), pattern.start(slot.block as usize));
+                let y = &self.scratch[slot.offset as usize - first..][..3 * dim];
+                add_columns(&mut self.reduced[start..start + dim], y, [z0, z1, z2]);
             }
-            if couplings.is_wide(point) {
-                for slot in of_point {
-                    let y = &self.scratch[slot.offset as usize - first..];
-                    self.wide.extend_from_slice(&y[..3 * pattern.dim(slot.block as usize)]);
-                }
-                continue;
-            }
-            for (position, row) in of_point.iter().enumerate() {
-                let row_dim = pattern.dim(row.block as usize);
-                let row_y = &self.scratch[row.offset as usize - first..][..3 * row_dim];
-                let first_column = if is_implicit { position } else { 0 };
-                for column in &of_point[first_column..=position] {
-                    let column_dim = pattern.dim(column.block as usize);
-                    let column_y = &self.scratch[column.offset as usize - first..][..3 * column_dim];
-                    let offset = pattern.offset(row.block as usize, column.block as usize);
-                    let values = &mut self.schur[offset..offset + row_dim * column_dim];
-                    if row_dim == D && column_dim == D {
-                        subtract_outer::<D, D>(values, row_y, column_y);
-                    } else if row_dim == STITCHING && column_dim == D {
-                        subtract_outer::<STITCHING, D>(values, row_y, column_y);
-                    } else if row_dim == STITCHING && column_dim == STITCHING {
-                        subtract_outer::<STITCHING, STITCHING>(values, row_y, column_y);
-                    } else {
-                        subtract_outer_sized(values, row_y, column_y, row_dim, column_dim);
+            match &couplings.copies {
+                Some(copies) => {
+                    self.factors[index] = factor;
+                    let first_copy = copies.starts[self.points.start];
+                    for copy in copies.of_points(&(point..point + 1)) {
+                        let slots = &couplings.slots[copies.slots(copy)];
+                        let Some(factor) = point_factor(&self.copy_hessian[copy - first_copy], lambda) else {
+                            self.usable = false;
+                            continue;
+                        };
+                        self.scale_couplings(slots, &factor, pattern);
+                        self.subtract_products::<D>(slots, pattern);
                     }
+                }
+                None => self.subtract_products::<D>(of_point, pattern),
+            }
+        }
+    }
+
+    /// Sets the scratch memory to W V⁻¹ᐟ² of these slots, which follow each other.
+    #[inline]
+    fn scale_couplings(&mut self, slots: &[Slot], factor: &[f64; 6], pattern: &BlockPattern) {
+        let &[i00, l10, i11, l20, l21, i22] = factor;
+        let first = slots[0].offset as usize;
+        for slot in slots {
+            let dim = pattern.dim(slot.block as usize);
+            let w = &self.coupling[slot.offset as usize..][..3 * dim];
+            let y = &mut self.scratch[slot.offset as usize - first..][..3 * dim];
+            for row in 0..dim {
+                let y0 = w[row] * i00;
+                let y1 = (w[dim + row] - l10 * y0) * i11;
+                let y2 = (w[2 * dim + row] - l20 * y0 - l21 * y1) * i22;
+                (y[row], y[dim + row], y[2 * dim + row]) = (y0, y1, y2);
+            }
+        }
+    }
+
+    /// Subtracts the products of what is in the scratch memory for these slots from the blocks of S.
+    #[inline]
+    fn subtract_products<const D: usize>(&mut self, slots: &[Slot], pattern: &BlockPattern) {
+        let first = slots[0].offset as usize;
+        for (position, row) in slots.iter().enumerate() {
+            let row_dim = pattern.dim(row.block as usize);
+            let row_y = &self.scratch[row.offset as usize - first..][..3 * row_dim];
+            for column in &slots[..=position] {
+                let column_dim = pattern.dim(column.block as usize);
+                let column_y = &self.scratch[column.offset as usize - first..][..3 * column_dim];
+                let offset = pattern.offset(row.block as usize, column.block as usize);
+                let values = &mut self.schur[offset..offset + row_dim * column_dim];
+                if row_dim == D && column_dim == D {
+                    subtract_outer::<D, D>(values, row_y, column_y);
+                } else if row_dim == STITCHING && column_dim == D {
+                    subtract_outer::<STITCHING, D>(values, row_y, column_y);
+                } else if row_dim == STITCHING && column_dim == STITCHING {
+                    subtract_outer::<STITCHING, STITCHING>(values, row_y, column_y);
+                } else {
+                    subtract_outer_sized(values, row_y, column_y, row_dim, column_dim);
                 }
             }
         }

@@ -1,24 +1,23 @@
 //! Preconditioned conjugate gradients on a reduced camera system that is never formed.
 //!
 //! S. Agarwal, N. Snavely, S. Seitz, R. Szeliski, "Bundle Adjustment in the Large", ECCV 2010, section 4: products with
-//! S by its factors ("implicit"), block-Jacobi preconditioner of the diagonal blocks of S ("Schur-Jacobi"), steps that
-//! are only as exact as is useful ("inexact").
+//! S by its factors ("implicit"), steps that are only as exact as is useful ("inexact"). The preconditioner is a factorization of
+//! what S is with [points split](super::split).
 
-use nalgebra::DMatrix;
-
+use super::camera_system::CameraSystem;
 use super::elimination::{Chunk, Couplings, for_each_chunk};
 use super::pattern::BlockPattern;
 
-/// Most iterations of one step. A long chain of cameras held at one end wants thousands, and Cholesky.
+/// Most iterations of one step.
 const MAX_ITERATIONS: u32 = 500;
 /// Relative residual to which a step is solved, in the norm of the preconditioner.
-const FORCING: f64 = 0.1;
+const FORCING: f64 = 0.01;
 
 /// S = U + λD − W V⁻¹ Wᵀ by its parts.
 pub(super) struct ImplicitSchur<'a> {
     /// The points' part, W and V⁻¹ of which are in the chunks.
     pub couplings: &'a Couplings,
-    /// Blocks of U.
+    /// Blocks of U, among others.
     pub pattern: &'a BlockPattern,
     /// Values of U.
     pub base: &'a [f64],
@@ -44,7 +43,9 @@ impl ImplicitSchur<'_> {
         }
         for column_block in 0..pattern.block_count() {
             let (columns, start) = (pattern.dim(column_block), pattern.start(column_block));
-            for (row_block, offset) in pattern.column(column_block) {
+            // What comes behind U is fill by copies of points.
+            let of_base = pattern.column(column_block).filter(|&(_, offset)| offset < pattern.base_len());
+            for (row_block, offset) in of_base {
                 let (rows, row_start) = (pattern.dim(row_block), pattern.start(row_block));
                 for (column, values) in base[offset..offset + rows * columns].chunks_exact(rows).enumerate() {
                     let mut transposed = 0.0;
@@ -62,10 +63,9 @@ impl ImplicitSchur<'_> {
 }
 
 /// Preconditioner and memory of the iterations.
-#[derive(Debug, Default)]
 pub(super) struct IterativeSystem {
-    /// Inverse diagonal blocks of S at the offsets of the blocks.
-    inverse_blocks: Vec<f64>,
+    /// None where there is no memory for it.
+    preconditioner: Option<CameraSystem>,
     residual: Vec<f64>,
     direction: Vec<f64>,
     product: Vec<f64>,
@@ -75,16 +75,17 @@ pub(super) struct IterativeSystem {
 }
 
 impl IterativeSystem {
-    /// Allocates for systems of one pattern.
-    pub fn new(pattern: &BlockPattern) -> Self {
+    /// Allocates for systems of one pattern, preconditioned by a factorization of what has it.
+    pub fn new(pattern: &BlockPattern, preconditioner: Option<CameraSystem>) -> Self {
         let vector = || vec![0.0; pattern.size()];
         Self {
-            inverse_blocks: vec![0.0; pattern.base_len()],
+            preconditioner,
             residual: vector(),
             direction: vector(),
             product: vector(),
             preconditioned: vector(),
-            ..Self::default()
+            iterations: 0,
+            truncated: 0,
         }
     }
 
@@ -98,17 +99,9 @@ impl IterativeSystem {
         self.truncated
     }
 
-    /// Inverts the diagonal blocks of S for the preconditioner; false when one is not positive definite.
+    /// Factorizes the preconditioner; false when it is not positive definite.
     pub fn prepare(&mut self, pattern: &BlockPattern, blocks: &[f64]) -> bool {
-        (0..pattern.block_count()).all(|block| {
-            let (offset, dim) = (pattern.offset(block, block), pattern.dim(block));
-            let range = offset..offset + dim * dim;
-            let Some(factor) = DMatrix::from_column_slice(dim, dim, &blocks[range.clone()]).cholesky() else {
-                return false;
-            };
-            self.inverse_blocks[range].copy_from_slice(factor.inverse().as_slice());
-            true
-        })
+        self.preconditioner.as_mut().is_none_or(|preconditioner| preconditioner.factorize(pattern, blocks))
     }
 
     /// Solves S x = b in place as exactly as a Newton step needs; false when S is not positive definite along a
@@ -116,16 +109,17 @@ impl IterativeSystem {
     ///
     /// `multiply(x, y)` sets y = S x. Meeting the limit of iterations is counted and no failure: each of them decreases
     /// the quadratic model.
-    pub fn solve(
-        &mut self,
-        pattern: &BlockPattern,
-        right: &mut [f64],
-        mut multiply: impl FnMut(&[f64], &mut [f64]),
-    ) -> bool {
-        let Self { inverse_blocks, residual, direction, product, preconditioned, .. } = self;
+    pub fn solve(&mut self, right: &mut [f64], mut multiply: impl FnMut(&[f64], &mut [f64])) -> bool {
+        let Self { preconditioner, residual, direction, product, preconditioned, .. } = self;
+        let mut precondition = |from: &[f64], to: &mut [f64]| {
+            to.copy_from_slice(from);
+            if let Some(preconditioner) = preconditioner {
+                preconditioner.solve(to);
+            }
+        };
         residual.copy_from_slice(right);
         right.fill(0.0);
-        precondition(pattern, inverse_blocks, residual, preconditioned);
+        precondition(residual, preconditioned);
         direction.copy_from_slice(preconditioned);
         let initial = dot(residual, preconditioned);
         let mut rho = initial;
@@ -142,7 +136,7 @@ impl IterativeSystem {
             }
             add_scaled(right, length, direction);
             add_scaled(residual, -length, product);
-            precondition(pattern, inverse_blocks, residual, preconditioned);
+            precondition(residual, preconditioned);
             let next = dot(residual, preconditioned);
             let share = next / rho;
             for (direction, preconditioned) in direction.iter_mut().zip(&*preconditioned) {
@@ -152,18 +146,6 @@ impl IterativeSystem {
         }
         self.truncated += u32::from(rho > sought);
         rho.is_finite()
-    }
-}
-
-/// `to` = M⁻¹ `from` block by block.
-fn precondition(pattern: &BlockPattern, inverse_blocks: &[f64], from: &[f64], to: &mut [f64]) {
-    for block in 0..pattern.block_count() {
-        let (offset, dim, start) = (pattern.offset(block, block), pattern.dim(block), pattern.start(block));
-        let (from, to) = (&from[start..start + dim], &mut to[start..start + dim]);
-        to.fill(0.0);
-        for (column, &value) in inverse_blocks[offset..offset + dim * dim].chunks_exact(dim).zip(from) {
-            add_scaled(to, value, column);
-        }
     }
 }
 
@@ -179,7 +161,10 @@ fn add_scaled(to: &mut [f64], factor: f64, from: &[f64]) {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::DMatrix;
+
     use super::*;
+    use crate::bundle::camera_system::Budget;
 
     /// A positive definite matrix of three blocks, its pattern and values of the diagonal blocks.
     fn example() -> (DMatrix<f64>, BlockPattern, Vec<f64>) {
@@ -198,6 +183,10 @@ mod tests {
         (matrix, pattern, blocks)
     }
 
+    fn preconditioned(pattern: &BlockPattern) -> IterativeSystem {
+        IterativeSystem::new(pattern, CameraSystem::new(pattern, &Budget::MEMORY))
+    }
+
     fn multiply_by(matrix: &DMatrix<f64>) -> impl FnMut(&[f64], &mut [f64]) + '_ {
         move |x, to| to.copy_from_slice((matrix * DMatrix::from_column_slice(x.len(), 1, x)).as_slice())
     }
@@ -205,13 +194,13 @@ mod tests {
     #[test]
     fn repeated_steps_converge_to_the_solution() {
         let (matrix, pattern, blocks) = example();
-        let mut system = IterativeSystem::new(&pattern);
+        let mut system = preconditioned(&pattern);
         assert!(system.prepare(&pattern, &blocks));
         let truth = DMatrix::from_fn(8, 1, |row, _| (row as f64).cos());
         let mut found = DMatrix::zeros(8, 1);
         for _ in 0..14 {
             let mut step = (&matrix * (&truth - &found)).as_slice().to_vec();
-            assert!(system.solve(&pattern, &mut step, multiply_by(&matrix)));
+            assert!(system.solve(&mut step, multiply_by(&matrix)));
             found += DMatrix::from_column_slice(8, 1, &step);
         }
         assert!((found - truth).norm() < 1e-10);
@@ -230,10 +219,10 @@ mod tests {
                 }
             }
         }
-        let mut system = IterativeSystem::new(&pattern);
+        let mut system = preconditioned(&pattern);
         assert!(system.prepare(&pattern, &blocks));
         let mut right = (&matrix * DMatrix::repeat(8, 1, 1.0)).as_slice().to_vec();
-        assert!(system.solve(&pattern, &mut right, multiply_by(&matrix)));
+        assert!(system.solve(&mut right, multiply_by(&matrix)));
         assert!(right.iter().all(|value| (value - 1.0).abs() < 1e-12));
         assert_eq!(system.iterations(), 1);
     }
@@ -241,21 +230,38 @@ mod tests {
     #[test]
     fn refuses_what_is_not_positive_definite() {
         let (matrix, pattern, mut blocks) = example();
-        let mut system = IterativeSystem::new(&pattern);
+        let mut system = preconditioned(&pattern);
         assert!(system.prepare(&pattern, &blocks));
-        assert!(!system.solve(&pattern, &mut [1.0; 8], multiply_by(&-&matrix)));
-        assert!(!system.solve(&pattern, &mut [f64::NAN; 8], multiply_by(&matrix)));
+        assert!(!system.solve(&mut [1.0; 8], multiply_by(&-&matrix)));
+        assert!(!system.solve(&mut [f64::NAN; 8], multiply_by(&matrix)));
         blocks[pattern.offset(1, 1)] = -1.0;
         assert!(!system.prepare(&pattern, &blocks));
     }
 
     #[test]
+    fn what_the_limit_of_iterations_does_not_solve_is_counted() {
+        // A chain held at one end and pulled at the other.
+        let size = 3 * MAX_ITERATIONS as usize;
+        let mut system = IterativeSystem::new(&BlockPattern::new(vec![size]), None);
+        let mut right = vec![0.0; size];
+        right[size - 1] = 1.0;
+        let multiply = |x: &[f64], to: &mut [f64]| {
+            for (at, to) in to.iter_mut().enumerate() {
+                let next = x.get(at + 1).map_or(0.0, |next| x[at] - next);
+                *to = next + if at == 0 { x[0] } else { x[at] - x[at - 1] };
+            }
+        };
+        assert!(system.solve(&mut right, multiply));
+        assert_eq!((system.iterations(), system.truncated()), (u64::from(MAX_ITERATIONS), 1));
+    }
+
+    #[test]
     fn nothing_to_solve_is_solved() {
         let (matrix, pattern, blocks) = example();
-        let mut system = IterativeSystem::new(&pattern);
+        let mut system = preconditioned(&pattern);
         assert!(system.prepare(&pattern, &blocks));
         let mut right = [0.0; 8];
-        assert!(system.solve(&pattern, &mut right, multiply_by(&matrix)));
+        assert!(system.solve(&mut right, multiply_by(&matrix)));
         assert_eq!(right, [0.0; 8]);
     }
 }

@@ -8,8 +8,8 @@
 //! Work is cut into chunks of consecutive points whose number depends on the problem alone; each sums into its own
 //! memory and the chunks are added in order, so the bytes do not depend on the number of threads.
 //!
-//! S is formed and factorized while that is within a [`Budget`], but for what [wide points](super::wide) add; beyond, only its
-//! diagonal blocks are, and products with it are made from U, V and W.
+//! S is formed and factorized while that is within a [`Budget`]; beyond, that of [split points](super::split) is, and products with S
+//! are made from U, V and W.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -17,11 +17,11 @@ use setloc_features::MAX_CAMERA_PARAMS;
 
 use super::RobustLoss;
 use super::camera_system::{Budget, CameraSystem};
-use super::elimination::{Chunk, Couplings, Slot, StepSums, bounded, for_each_chunk};
+use super::elimination::{Chunk, Couplings, Slot, StepSums, bounded, for_each_chunk, insert_pairs};
 use super::iterative::{ImplicitSchur, IterativeSystem};
 use super::loss::LossSum;
 use super::pattern::{BlockPattern, NONE};
-use super::wide::{WidePoints, fill_by_narrow, insert_within};
+use super::split::{copied, split};
 
 /// Upper bound of the chunk count; more would cost more in reductions than it gains.
 const MAX_CHUNKS: usize = 8;
@@ -93,6 +93,8 @@ struct Target {
     block: u32,
     /// W offset of the extra block, or [`NONE`].
     extra: u32,
+    /// Copy of the point in its chunk, or [`NONE`].
+    copy: u32,
 }
 
 /// What is unknown, and which of it each observation touches.
@@ -110,12 +112,11 @@ pub(super) struct Structure {
     pub extra_dims: Vec<usize>,
 }
 
-#[expect(clippy::large_enum_variant, reason = "one per problem, never moved in a loop")]
 /// How S δ = b is solved.
 enum ReducedSystem {
-    /// By a factorization of S, or of what it is without wide points and what these add.
-    Direct(CameraSystem, Option<WidePoints>),
-    /// By products with S.
+    /// By a factorization of S.
+    Direct(CameraSystem),
+    /// By products with S and a factorization of what it is with points split.
     Iterative(IterativeSystem),
 }
 
@@ -128,12 +129,12 @@ pub(super) struct NormalEquations<const D: usize> {
     couplings: Couplings,
     points: Vec<Vector3<f64>>,
     block_count: usize,
-    /// Blocks of S, or of U alone when S stays implicit.
+    /// Blocks of S, or of what it is with points split.
     pattern: BlockPattern,
     chunks: Vec<Chunk>,
     base: Vec<f64>,
     gradient: Vec<f64>,
-    /// S in the blocks of the pattern; of an implicit S only the diagonal blocks are what they say.
+    /// S in the blocks of the pattern, or what it is with points split.
     schur: Vec<f64>,
     step: Vec<f64>,
     /// The step as it was proposed last.
@@ -159,7 +160,7 @@ impl<const D: usize> NormalEquations<D> {
         }
         let mut observation_starts = Vec::with_capacity(points.len() + 1);
         observation_starts.push(0);
-        let mut couplings = Couplings { starts: vec![0], slots: Vec::new(), free, wide: Vec::new() };
+        let mut couplings = Couplings { starts: vec![0], slots: Vec::new(), free, copies: None };
         let (mut end, mut touched) = (0, Vec::new());
         for point in 0..points.len() {
             let start = end;
@@ -184,11 +185,11 @@ impl<const D: usize> NormalEquations<D> {
             observation_starts.push(end);
         }
 
-        let filled = with_fill(&pattern, &mut couplings, budget);
+        let filled = if budget.is_of_whole() { with_fill(&pattern, &couplings, budget) } else { None };
         let mut work = 0;
         let work_until: Vec<usize> = (0..points.len())
             .map(|point| {
-                let touched = if couplings.is_wide(point) { 0 } else { couplings.of_point(point).len() };
+                let touched = couplings.of_point(point).len();
                 work += 2 * (observation_starts[point + 1] - observation_starts[point]) + touched * touched;
                 work
             })
@@ -197,20 +198,17 @@ impl<const D: usize> NormalEquations<D> {
             (work / WORK_PER_CHUNK).clamp(1, (MAX_CHUNK_VALUES / len.max(1)).clamp(1, MAX_CHUNKS))
         };
         let direct = filled.and_then(|filled| {
-            let columns = WidePoints::columns(&couplings);
-            let accumulated = filled.len() * (1 + chunks_of(filled.len())) + 2 * columns * filled.size();
-            let system = CameraSystem::new(&filled, columns.max(1), &budget.without(accumulated)?)?;
-            let wide = WidePoints::new(filled.size(), columns);
-            Some((filled, ReducedSystem::Direct(system, wide)))
+            let accumulated = filled.len() * (1 + chunks_of(filled.len()));
+            let system = CameraSystem::new(&filled, &budget.without(accumulated)?)?;
+            Some((filled, ReducedSystem::Direct(system)))
         });
         let (pattern, system) = direct.unwrap_or_else(|| {
-            couplings.wide.clear();
-            let system = ReducedSystem::Iterative(IterativeSystem::new(&pattern));
-            (pattern, system)
+            let (pattern, preconditioner) = split(&pattern, block_count, &links, &mut couplings, budget);
+            let system = IterativeSystem::new(&pattern, preconditioner);
+            (pattern, ReducedSystem::Iterative(system))
         });
 
         let chunk_count = chunks_of(pattern.len());
-        let is_implicit = matches!(system, ReducedSystem::Iterative(_));
         let (mut ranges, mut slots_left) = (Vec::with_capacity(chunk_count), &mut couplings.slots[..]);
         let mut first = 0;
         for index in 0..chunk_count {
@@ -236,13 +234,15 @@ impl<const D: usize> NormalEquations<D> {
                 scratch_len = scratch_len.max(coupling_len - before);
             }
             let count = range.len();
+            let copies = couplings.copies.as_ref().map(|copies| copies.of_points(&range).len());
             Chunk {
                 candidate: points[range.clone()].to_vec(),
                 points: range,
                 coupling: vec![0.0; coupling_len],
                 point_hessian: vec![[0.0; 6]; count],
                 point_gradient: vec![[0.0; 3]; count],
-                factors: vec![[0.0; 6]; if is_implicit { count } else { 0 }],
+                copy_hessian: vec![[0.0; 6]; copies.unwrap_or(0)],
+                factors: vec![[0.0; 6]; copies.map_or(0, |_| count)],
                 base: vec![0.0; pattern.base_len()],
                 gradient: vec![0.0; pattern.size()],
                 schur: vec![0.0; pattern.len()],
@@ -251,17 +251,22 @@ impl<const D: usize> NormalEquations<D> {
                 ..Chunk::default()
             }
         };
-        let chunks = ranges.into_par_iter().with_max_len(1).map(chunk).collect();
+        let chunks: Vec<Chunk> = ranges.into_par_iter().with_max_len(1).map(chunk).collect();
 
         let targets = links
             .par_iter()
             .with_min_len(WORK_PER_CHUNK)
             .map(|link| {
-                let of_point = couplings.of_point(link.point as usize);
+                let (mut seen, mut copy) = (couplings.of_point(link.point as usize), NONE);
+                if let Some(copies) = &couplings.copies
+                    && let Some(index) = copied(copies, &couplings.slots, link)
+                {
+                    seen = &couplings.slots[copies.slots(index)];
+                    let chunk = chunks.partition_point(|chunk| chunk.points.end <= link.point as usize);
+                    copy = (index - copies.starts[chunks[chunk].points.start]) as u32;
+                }
                 let offset_of = |block: u32| {
-                    of_point
-                        .binary_search_by_key(&block, |slot| slot.block)
-                        .map_or(NONE, |at| of_point[at].offset)
+                    seen.binary_search_by_key(&block, |slot| slot.block).map_or(NONE, |at| seen[at].offset)
                 };
                 let extra = if link.extra == NONE { NONE } else { extra_block(link) as u32 };
                 let coupled = link.block != NONE && extra != NONE;
@@ -273,6 +278,7 @@ impl<const D: usize> NormalEquations<D> {
                     },
                     block: offset_of(link.block),
                     extra: offset_of(extra),
+                    copy,
                 }
             })
             .collect();
@@ -314,7 +320,7 @@ impl<const D: usize> NormalEquations<D> {
     /// The iterative system with its counts, unless S is factorized.
     pub fn iterative(&self) -> Option<&IterativeSystem> {
         match &self.system {
-            ReducedSystem::Direct(..) => None,
+            ReducedSystem::Direct(_) => None,
             ReducedSystem::Iterative(system) => Some(system),
         }
     }
@@ -332,6 +338,7 @@ impl<const D: usize> NormalEquations<D> {
             chunk.coupling.fill(0.0);
             chunk.base.fill(0.0);
             chunk.gradient.fill(0.0);
+            chunk.copy_hessian.fill([0.0; 6]);
             let mut losses = LossSum::new(loss);
             let mut lin = Linearized {
                 residual: [0.0; 2],
@@ -350,13 +357,10 @@ impl<const D: usize> NormalEquations<D> {
                     let [p0, p1] = &lin.point;
                     let weighted = [p0.map(|value| weight * value), p1.map(|value| weight * value)];
                     if couplings.free[point] {
-                        let [q0, q1] = &weighted;
-                        v[0] += q0[0] * p0[0] + q1[0] * p1[0];
-                        v[1] += q0[1] * p0[0] + q1[1] * p1[0];
-                        v[2] += q0[1] * p0[1] + q1[1] * p1[1];
-                        v[3] += q0[2] * p0[0] + q1[2] * p1[0];
-                        v[4] += q0[2] * p0[1] + q1[2] * p1[1];
-                        v[5] += q0[2] * p0[2] + q1[2] * p1[2];
+                        add_point_square(&mut v, &weighted, &lin.point);
+                        if let Some(v) = chunk.copy_hessian.get_mut(target.copy as usize) {
+                            add_point_square(v, &weighted, &lin.point);
+                        }
                         for k in 0..3 {
                             g[k] += r0 * p0[k] + r1 * p1[k];
                         }
@@ -449,7 +453,7 @@ impl<const D: usize> NormalEquations<D> {
         cost
     }
 
-    /// Eliminates the points and factorizes S, or its diagonal blocks, for damping λ; false when that fails.
+    /// Eliminates the points and factorizes S, or what it is with points split, for damping λ; false when that fails.
     pub fn factorize(&mut self, lambda: f64) -> bool {
         for block in 0..self.pattern.block_count() {
             let (offset, dim, start) =
@@ -492,13 +496,10 @@ impl<const D: usize> NormalEquations<D> {
     }
 
     fn factorize_schur(&mut self) -> bool {
-        let Self { pattern, schur, system, chunks, couplings, .. } = self;
+        let Self { pattern, schur, system, .. } = self;
         match system {
             _ if pattern.size() == 0 => true,
-            ReducedSystem::Direct(system, wide) => {
-                system.factorize(pattern, schur)
-                    && wide.as_mut().is_none_or(|wide| wide.factorize((chunks, couplings, pattern), system))
-            }
+            ReducedSystem::Direct(system) => system.factorize(pattern, schur),
             ReducedSystem::Iterative(system) => system.prepare(pattern, schur),
         }
     }
@@ -518,8 +519,8 @@ impl<const D: usize> NormalEquations<D> {
             return true;
         }
         match system {
-            ReducedSystem::Direct(system, wide) => {
-                solve_by(system, wide.as_mut(), step);
+            ReducedSystem::Direct(system) => {
+                system.solve(step);
                 true
             }
             ReducedSystem::Iterative(system) => {
@@ -527,7 +528,7 @@ impl<const D: usize> NormalEquations<D> {
                 *eliminated_for = None;
                 let schur = ImplicitSchur { couplings, pattern, base, damping };
                 let multiply = |x: &[f64], to: &mut [f64]| schur.multiply::<D>(chunks, x, to);
-                system.solve(pattern, step, multiply)
+                system.solve(step, multiply)
             }
         }
     }
@@ -602,8 +603,8 @@ impl<const D: usize> NormalEquations<D> {
     /// Solves S x = `right` in place, after [`NormalEquations::factorize`]; false when S is not factorized as a whole.
     pub fn solve_camera_side(&mut self, right: &mut [f64]) -> bool {
         match &mut self.system {
-            ReducedSystem::Direct(system, wide) => {
-                solve_by(system, wide.as_mut(), right);
+            ReducedSystem::Direct(system) => {
+                system.solve(right);
                 true
             }
             ReducedSystem::Iterative(_) => false,
@@ -611,22 +612,17 @@ impl<const D: usize> NormalEquations<D> {
     }
 }
 
-/// The blocks of U and those that shared points fill in, some of which may be marked as wide and left out; `None` when they are
-/// beyond the budget.
-fn with_fill(base: &BlockPattern, couplings: &mut Couplings, budget: &Budget) -> Option<BlockPattern> {
+/// The blocks of U and those that shared points fill in; `None` once they are beyond the budget.
+fn with_fill(base: &BlockPattern, couplings: &Couplings, budget: &Budget) -> Option<BlockPattern> {
     let mut pattern = base.clone();
-    if budget.allows_wide(base) {
-        return fill_by_narrow(&mut pattern, couplings, budget).then_some(pattern);
-    }
-    insert_within(budget, 0..couplings.free.len(), couplings, &mut pattern).then_some(pattern)
-}
-
-/// Solves S x = `right` in place by what is factorized.
-fn solve_by(of_narrow: &mut CameraSystem, wide: Option<&mut WidePoints>, right: &mut [f64]) {
-    of_narrow.solve(right, 1);
-    if let Some(wide) = wide {
-        wide.complete(right);
-    }
+    let fits = (0..couplings.free.len()).all(|point| {
+        let fits = budget.may_suffice(&pattern);
+        if fits {
+            insert_pairs(couplings.of_point(point), &mut pattern);
+        }
+        fits
+    });
+    fits.then_some(pattern)
 }
 
 /// Values of S that one task sums over all chunks.
@@ -637,6 +633,17 @@ fn add(to: &mut [f64], from: &[f64]) {
     for (to, from) in to.iter_mut().zip(from) {
         *to += from;
     }
+}
+
+/// Adds JᵀJ of an observation of a point to its V, a lower triangle by rows.
+#[inline]
+fn add_point_square(v: &mut [f64; 6], [q0, q1]: &[[f64; 3]; 2], [p0, p1]: &[[f64; 3]; 2]) {
+    v[0] += q0[0] * p0[0] + q1[0] * p1[0];
+    v[1] += q0[1] * p0[0] + q1[1] * p1[0];
+    v[2] += q0[1] * p0[1] + q1[1] * p1[1];
+    v[3] += q0[2] * p0[0] + q1[2] * p1[0];
+    v[4] += q0[2] * p0[1] + q1[2] * p1[1];
+    v[5] += q0[2] * p0[2] + q1[2] * p1[2];
 }
 
 /// `to` (rows of `a` × rows of `b`, by columns) += weight · Σ aᵢ bᵢᵀ.
@@ -718,47 +725,52 @@ mod tests {
         (Linear(linear), structure)
     }
 
-    #[test]
-    fn implicit_products_and_preconditioner_are_those_of_the_explicit_system() {
-        let (model, structure) = example();
-        let mut direct =
-            NormalEquations::<3>::new(structure(), &Budget::new(LinearSolver::Direct, model.0.len()));
-        let mut implicit =
-            NormalEquations::<3>::new(structure(), &Budget::new(LinearSolver::Iterative, model.0.len()));
-        for equations in [&mut direct, &mut implicit] {
-            equations.linearize(&model, 1e-2);
-            assert!(equations.factorize(1e-3));
-        }
-        assert!(implicit.schur.len() < direct.schur.len());
-        let size = direct.pattern.size();
-        let mut explicit = vec![vec![0.0; size]; size];
-        for column_block in 0..direct.pattern.block_count() {
-            let (columns, start) = (direct.pattern.dim(column_block), direct.pattern.start(column_block));
-            for (row_block, offset) in direct.pattern.column(column_block) {
-                let rows = direct.pattern.dim(row_block);
-                for (index, &value) in direct.schur[offset..offset + rows * columns].iter().enumerate() {
-                    let row = direct.pattern.start(row_block) + index % rows;
-                    let column = start + index / rows;
-                    explicit[column][row] = value;
-                    explicit[row][column] = value;
+    /// The blocks of S as a full matrix.
+    fn full(pattern: &BlockPattern, blocks: &[f64]) -> Vec<Vec<f64>> {
+        let mut full = vec![vec![0.0; pattern.size()]; pattern.size()];
+        for column_block in 0..pattern.block_count() {
+            let (columns, start) = (pattern.dim(column_block), pattern.start(column_block));
+            for (row_block, offset) in pattern.column(column_block) {
+                let rows = pattern.dim(row_block);
+                for (index, &value) in blocks[offset..offset + rows * columns].iter().enumerate() {
+                    let (row, column) = (pattern.start(row_block) + index % rows, start + index / rows);
+                    full[column][row] = value;
+                    full[row][column] = value;
                 }
             }
         }
-        let NormalEquations { couplings, pattern, base, damping, chunks, schur, .. } = &mut implicit;
-        let operator = ImplicitSchur { couplings, pattern, base, damping };
-        for (column, explicit) in explicit.iter().enumerate() {
-            let (mut x, mut product) = (vec![0.0; size], vec![0.0; size]);
-            x[column] = 1.0;
-            operator.multiply::<3>(chunks, &x, &mut product);
-            for (product, explicit) in product.iter().zip(explicit) {
-                assert!((product - explicit).abs() < 1e-12, "column {column}: {product} {explicit}");
+        full
+    }
+
+    fn assert_near(found: &[f64], expected: &[f64], bound: f64) {
+        for (row, (found, expected)) in found.iter().zip(expected).enumerate() {
+            assert!((found - expected).abs() < bound, "row {row}: {found} {expected}");
+        }
+    }
+
+    #[test]
+    fn implicit_products_are_those_of_the_explicit_system() {
+        let (small, of_small) = example();
+        let (street, of_street) = street(250);
+        let of_structure = |model: &Linear, structure: &dyn Fn() -> Structure, budget: &Budget| {
+            let mut direct = NormalEquations::<3>::new(structure(), &Budget::MEMORY);
+            let mut implicit = NormalEquations::<3>::new(structure(), budget);
+            for equations in [&mut direct, &mut implicit] {
+                equations.linearize(model, 1e-2);
+                assert!(equations.factorize(1e-3));
             }
-        }
-        for block in 0..pattern.block_count() {
-            let (offset, dim) = (pattern.offset(block, block), pattern.dim(block));
-            let explicit = &direct.schur[direct.pattern.offset(block, block)..][..dim * dim];
-            assert_eq!(&schur[offset..offset + dim * dim], explicit);
-        }
+            let explicit = full(&direct.pattern, &direct.schur);
+            let NormalEquations { couplings, pattern, base, damping, chunks, .. } = &mut implicit;
+            let operator = ImplicitSchur { couplings, pattern, base, damping };
+            for (column, explicit) in explicit.iter().enumerate() {
+                let (mut x, mut product) = (vec![0.0; explicit.len()], vec![0.0; explicit.len()]);
+                x[column] = 1.0;
+                operator.multiply::<3>(chunks, &x, &mut product);
+                assert_near(&product, explicit, 1e-10);
+            }
+        };
+        of_structure(&small, &of_small, &Budget::new(LinearSolver::Iterative, small.0.len()));
+        of_structure(&street, &of_street, &Budget::tight());
     }
 
     #[test]
@@ -769,7 +781,7 @@ mod tests {
             [(LinearSolver::Auto, true), (LinearSolver::Direct, true), (LinearSolver::Iterative, false)]
         {
             let equations = NormalEquations::<3>::new(structure(), &Budget::new(solver, count));
-            assert_eq!(matches!(equations.system, ReducedSystem::Direct(..)), is_direct, "{solver:?}");
+            assert_eq!(matches!(equations.system, ReducedSystem::Direct(_)), is_direct, "{solver:?}");
         }
         let needed = NormalEquations::<3>::new(structure(), &Budget::MEMORY).pattern.len();
         let tight = Budget::MEMORY.without((1 << 28) - needed).unwrap();
@@ -805,40 +817,63 @@ mod tests {
     }
 
     #[test]
-    fn points_that_all_see_are_kept_out_of_the_system_and_leave_its_solution_as_it_is() {
+    fn preconditioner_is_the_system_of_the_split_problem() {
         let (model, structure) = street(250);
-        let direct = Budget::new(LinearSolver::Direct, model.0.len());
-        let mut equations =
-            [direct, Budget::MEMORY].map(|budget| NormalEquations::<3>::new(structure(), &budget));
-        let wide =
-            |equations: &NormalEquations<3>| equations.couplings.wide.iter().filter(|&&wide| wide).count();
-        assert_eq!(equations.each_ref().map(wide), [3, 0], "the fourth is no unknown");
-        assert!(4 * equations[0].pattern.len() < equations[1].pattern.len());
-        for lambda in [1e-3, 1.0] {
-            let steps = equations.each_mut().map(|equations| {
-                equations.linearize(&model, 1.0);
-                assert!(equations.factorize(lambda) && equations.solve());
-                let mut column = vec![0.0; equations.step().len()];
-                column[7] = 1.0;
-                assert!(equations.solve_camera_side(&mut column));
-                [equations.step().to_vec(), column]
-            });
-            for (step, expected) in steps[0].iter().flatten().zip(steps[1].iter().flatten()) {
-                assert!((step - expected).abs() < 1e-9, "{step} {expected}");
-            }
+        let mut implicit = NormalEquations::<3>::new(structure(), &Budget::tight());
+        let copies = implicit.couplings.copies.as_ref().unwrap();
+        // Copies as points of their own; what is no unknown has none.
+        let mut split = structure();
+        let copied: Vec<_> =
+            split.links.iter().map(|link| copied(copies, &implicit.couplings.slots, link)).collect();
+        let fixed = copies.count();
+        assert!(fixed > split.points.len() + 100);
+        let mut order: Vec<usize> = (0..split.links.len()).collect();
+        order.sort_by_key(|&at| copied[at].unwrap_or(fixed));
+        let link = |&at: &usize| Link { point: copied[at].unwrap_or(fixed) as u32, ..split.links[at] };
+        split.links = order.iter().map(link).collect();
+        split.points = vec![Vector3::zeros(); fixed + 1];
+        split.free = (0..=fixed).map(|copy| copy < fixed).collect();
+        let of_split = Linear(order.iter().map(|&at| model.0[at]).collect());
+        let mut direct = NormalEquations::<3>::new(split, &Budget::MEMORY);
+        direct.linearize(&of_split, 1e-2);
+        implicit.linearize(&model, 1e-2);
+        assert!(direct.factorize(1e-3) && implicit.factorize(1e-3));
+        let [found, expected] =
+            [&implicit, &direct].map(|equations| full(&equations.pattern, &equations.schur));
+        for (found, expected) in found.iter().zip(&expected) {
+            assert_near(found, expected, 1e-10);
         }
     }
 
     #[test]
-    fn a_system_that_wide_points_make_indefinite_is_refused() {
+    fn few_iterations_solve_a_street_with_points_that_all_see() {
         let (model, structure) = street(250);
         let mut equations =
-            NormalEquations::<3>::new(structure(), &Budget::new(LinearSolver::Direct, model.0.len()));
+            [Budget::tight(), Budget::MEMORY].map(|budget| NormalEquations::<3>::new(structure(), &budget));
+        assert!(4 * equations[0].pattern.len() < equations[1].pattern.len());
+        for lambda in [1e-6, 1.0] {
+            let before = equations[0].iterative().unwrap().iterations();
+            let [found, expected] = equations.each_mut().map(|equations| {
+                equations.linearize(&model, 1.0);
+                assert!(equations.factorize(lambda) && equations.solve());
+                equations.step().to_vec()
+            });
+            let of =
+                |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>().sqrt();
+            let apart = of(&mut found.iter().zip(&expected).map(|(found, expected)| found - expected));
+            assert!(apart < 0.02 * of(&mut expected.iter().copied()), "{apart}");
+            let iterations = equations[0].iterative().unwrap().iterations() - before;
+            assert!((1..40).contains(&iterations), "{iterations}");
+        }
+    }
+
+    #[test]
+    fn a_preconditioner_that_is_indefinite_is_refused() {
+        let (model, structure) = street(250);
+        let mut equations = NormalEquations::<3>::new(structure(), &Budget::tight());
         equations.linearize(&model, 1e-3);
         assert!(equations.factorize(1e-3));
-        for chunk in &mut equations.chunks {
-            chunk.wide.iter_mut().for_each(|value| *value *= 10.0);
-        }
+        equations.schur[0] = -1.0;
         assert!(!equations.factorize_schur());
     }
 }
