@@ -47,9 +47,10 @@ impl Copies {
         self.slot_starts.len() - 1
     }
 
-    /// Copies of some points.
-    pub fn of_points(&self, points: &Range<usize>) -> Range<usize> {
-        self.starts[points.start]..self.starts[points.end]
+    /// Copies of a point.
+    #[inline]
+    pub fn of_point(&self, point: usize) -> Range<usize> {
+        self.starts[point]..self.starts[point + 1]
     }
 
     /// Slots of a copy, ascending by block.
@@ -144,7 +145,7 @@ impl Chunk {
                 Some(copies) => {
                     self.factors[index] = factor;
                     let first_copy = copies.starts[self.points.start];
-                    for copy in copies.of_points(&(point..point + 1)) {
+                    for copy in copies.of_point(point) {
                         let slots = &couplings.slots[copies.slots(copy)];
                         let Some(factor) = point_factor(&self.copy_hessian[copy - first_copy], lambda) else {
                             self.usable = false;

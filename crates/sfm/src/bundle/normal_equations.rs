@@ -234,7 +234,8 @@ impl<const D: usize> NormalEquations<D> {
                 scratch_len = scratch_len.max(coupling_len - before);
             }
             let count = range.len();
-            let copies = couplings.copies.as_ref().map(|copies| copies.of_points(&range).len());
+            let copies = (couplings.copies.as_ref())
+                .map(|copies| copies.starts[range.end] - copies.starts[range.start]);
             Chunk {
                 candidate: points[range.clone()].to_vec(),
                 points: range,

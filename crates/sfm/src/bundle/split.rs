@@ -69,9 +69,8 @@ pub(super) fn split(
 
 /// The copy that an observation is of, if its point is an unknown that anything unknown sees.
 pub(super) fn copied(copies: &Copies, slots: &[Slot], link: &Link) -> Option<usize> {
-    let point = link.point as usize;
     // What a known pose sees counts for one of them.
-    copies.of_points(&(point..point + 1)).find(|&copy| {
+    copies.of_point(link.point as usize).find(|&copy| {
         link.block == NONE || slots[copies.slots(copy)].iter().any(|slot| slot.block == link.block)
     })
 }
@@ -157,12 +156,12 @@ fn copies(couplings: &Couplings, poses: usize, links: &[Link], akin: &BlockPatte
 /// Parts the poses that see a point so that all of a part are akin: the one with most kin first, each into the first part that takes it.
 fn groups(seen: &[Slot], poses: usize, akin: &BlockPattern) -> Vec<Vec<u32>> {
     let are_akin = |a: u32, b: u32| akin.contains(a.max(b) as usize, a.min(b) as usize);
-    let mut by_kin: Vec<u32> =
+    let seen_by: Vec<u32> =
         seen.iter().map(|slot| slot.block).take_while(|&block| (block as usize) < poses).collect();
-    let kin = |of: u32| {
-        seen.iter().filter(|slot| (slot.block as usize) < poses && are_akin(of, slot.block)).count()
-    };
-    by_kin.sort_by_cached_key(|&pose| std::cmp::Reverse(kin(pose)));
+    let mut by_kin = seen_by.clone();
+    by_kin.sort_by_cached_key(|&pose| {
+        std::cmp::Reverse(seen_by.iter().filter(|&&other| are_akin(pose, other)).count())
+    });
     let mut groups: Vec<Vec<u32>> = Vec::new();
     for pose in by_kin {
         match groups.iter_mut().find(|group| group.iter().all(|&other| are_akin(pose, other))) {
