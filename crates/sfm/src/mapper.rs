@@ -28,6 +28,7 @@ mod repeated;
 mod sides;
 mod standpoint;
 mod stitching;
+mod stray;
 mod structure;
 mod support;
 #[cfg(test)]
@@ -70,14 +71,14 @@ use self::{
     repeated::Underfoot,
     standpoint::Standpoints,
     stitching::measure_stitching,
-    structure::{PointLimits, complete_and_merge, filter, triangulate_image, triangulate_match},
+    structure::{PointLimits, complete_and_merge, filter, separate, triangulate_image, triangulate_match},
     told::{correct_told, corrections, said_of_corrections},
     witnesses::Witnesses,
 };
 use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind, bundle::BundleParams};
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 72;
+pub const MAPPER_VERSION: u32 = 78;
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///
@@ -162,6 +163,12 @@ fn enabled_pairs(input: &MapperInput<'_>, taken: &[bool]) -> Vec<bool> {
     input.pairs.iter().map(|pair| !taken[pair.first.index()] && !taken[pair.second.index()]).collect()
 }
 
+/// All matches of the enabled pairs.
+fn graph_of(input: &MapperInput<'_>, enabled: &[bool]) -> CorrespondenceGraph {
+    let counts: Vec<usize> = input.images.iter().map(|image| image.features.len()).collect();
+    CorrespondenceGraph::build(&counts, input.pairs, enabled)
+}
+
 /// How many times farther off observations may be when a finished model is opened to them once more.
 ///
 /// A model keeps what agrees with it, and what it keeps holds it where it is: a panorama that came in a quarter of a
@@ -226,10 +233,9 @@ impl<'a> Mapper<'a> {
     fn over(params: &'a MapperParams, model: Model<'a>, taken: Vec<bool>, seed: u64) -> Self {
         let input = model.input;
         let enabled = enabled_pairs(input, &taken);
-        let counts: Vec<usize> = input.images.iter().map(|image| image.features.len()).collect();
         Self {
             params,
-            graph: CorrespondenceGraph::build(&counts, input.pairs, &enabled),
+            graph: graph_of(input, &enabled),
             images_at_last_global: model.registered_count().max(2),
             model,
             enabled,
@@ -247,6 +253,13 @@ impl<'a> Mapper<'a> {
             admits_by_depths: false,
             seed,
         }
+    }
+
+    /// Takes no match of these pairs any more, nor what only they tie together. Returns the observations dropped.
+    fn leave_out(&mut self, pairs: &[bool]) -> usize {
+        self.enabled.iter_mut().zip(pairs).for_each(|(enabled, left_out)| *enabled &= !left_out);
+        self.graph = graph_of(self.model.input, &self.enabled);
+        separate(&mut self.model, &self.graph)
     }
 
     /// Lets images come in from now on that only their pairs speak for.

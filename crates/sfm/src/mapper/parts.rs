@@ -209,6 +209,7 @@ impl<'a> Parts<'a> {
         let mut report = self.report;
         let mut components = Vec::new();
         for part in self.all {
+            let part = part.without_stray_matches(self.params, self.input, self.seed);
             let (component, unheld) = part.seen_again(self.params, self.input, self.seed).without_unheld();
             for image in unheld {
                 let name = &component.images[image.index()].name;

@@ -253,6 +253,11 @@ pub(super) fn filter(model: &mut Model<'_>, limits: PointLimits, points: &[Point
         (!stays || !bad.is_empty()).then_some((id, stays, bad))
     };
     let judged: Vec<_> = points.par_iter().with_min_len(POINTS_PER_TASK).filter_map(judge).collect();
+    drop_observations(model, judged)
+}
+
+/// Drops these observations of each point, or the point where it does not stay. Returns the observations dropped.
+fn drop_observations(model: &mut Model<'_>, judged: Vec<(PointId, bool, Vec<Observation>)>) -> usize {
     let mut dropped = 0;
     for (id, stays, bad) in judged {
         let Some(point) = model.point(id) else { continue };
@@ -267,4 +272,37 @@ pub(super) fn filter(model: &mut Model<'_>, limits: PointLimits, points: &[Point
         }
     }
     dropped
+}
+
+/// Leaves of each point the views that matches still tie together, of several such groups the largest. Returns the observations
+/// dropped.
+pub(super) fn separate(model: &mut Model<'_>, graph: &CorrespondenceGraph) -> usize {
+    let judge = |&id: &PointId| {
+        let kept = largest_group(&model.point(id)?.track, graph);
+        let gone = |seen: &&Observation| !kept.contains(seen);
+        let gone: Vec<Observation> = model.point(id)?.track.iter().filter(gone).copied().collect();
+        (!gone.is_empty()).then_some((id, kept.len() >= 2, gone))
+    };
+    let ids = model.live_ids();
+    let judged: Vec<_> = ids.par_iter().with_min_len(POINTS_PER_TASK).filter_map(judge).collect();
+    drop_observations(model, judged)
+}
+
+/// The most views of a track that matches tie together, of as many those of the first.
+fn largest_group(track: &[Observation], graph: &CorrespondenceGraph) -> Vec<Observation> {
+    let mut largest = Vec::new();
+    let mut open = track.to_vec();
+    while let Some(first) = (!open.is_empty()).then(|| open.remove(0)) {
+        let mut group = vec![first];
+        let mut next = 0;
+        while let Some(seen) = group.get(next) {
+            let tied = graph.partners(seen.image, seen.feature);
+            group.extend(open.extract_if(.., |other| tied.contains(other)));
+            next += 1;
+        }
+        if group.len() > largest.len() {
+            largest = group;
+        }
+    }
+    largest
 }

@@ -80,6 +80,26 @@ impl Street {
         self.features.push(features);
     }
 
+    /// Adds a pair of two panoramas each of whose matches is of two points.
+    pub fn match_wrongly(&mut self, first: usize, second: usize) {
+        let mut wrong = pair(&self.poses, first, second, POINTS);
+        for (at, m) in wrong.two_view.inliers.iter_mut().enumerate() {
+            (m.first, m.second) = Self::wrong_match(at as u32);
+        }
+        self.pairs.push(wrong);
+    }
+
+    /// The keypoints of one of its matches.
+    pub fn wrong_match(at: u32) -> (u32, u32) {
+        (at, (at + POINTS as u32 / 2 + 1) % POINTS as u32)
+    }
+
+    /// Forgets the pair of two panoramas.
+    pub fn unpair(&mut self, first: usize, second: usize) {
+        let [first, second] = [first, second].map(|image| ImageId(image as u32));
+        self.pairs.retain(|pair| (pair.first, pair.second) != (first, second));
+    }
+
     pub fn graph(&self) -> CorrespondenceGraph {
         CorrespondenceGraph::build(
             &vec![POINTS; self.features.len()],
