@@ -78,7 +78,7 @@ use self::{
 use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind, bundle::BundleParams};
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 78;
+pub const MAPPER_VERSION: u32 = 79;
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///
@@ -259,7 +259,8 @@ impl<'a> Mapper<'a> {
     fn leave_out(&mut self, pairs: &[bool]) -> usize {
         self.enabled.iter_mut().zip(pairs).for_each(|(enabled, left_out)| *enabled &= !left_out);
         self.graph = graph_of(self.model.input, &self.enabled);
-        separate(&mut self.model, &self.graph)
+        let left_out = graph_of(self.model.input, pairs);
+        separate(&mut self.model, &self.graph, &left_out)
     }
 
     /// Lets images come in from now on that only their pairs speak for.

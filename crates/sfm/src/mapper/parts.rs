@@ -56,11 +56,30 @@ impl Part {
         if !projection::has_images_with_few_points(&self.component) {
             return self;
         }
+        let mut mapper = self.mapper(params, input, seed);
+        mapper.leave_out_strays();
+        if mapper.see_again() { mapper.into_part() } else { self }
+    }
+
+    /// The part adjusted without what pairs of images far apart tie that disagree with it; as it is where none do.
+    fn without_strays(self, params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> Self {
+        let mut mapper = self.mapper(params, input, seed);
+        if mapper.leave_out_strays() == 0 {
+            return self;
+        }
+        mapper.refine(1, 20);
+        mapper.adjust_all(30);
+        mapper.filter_all(params.limits());
+        mapper.into_part()
+    }
+
+    /// A mapper at work on its images alone.
+    fn mapper<'a>(&self, params: &'a MapperParams, input: &'a MapperInput<'a>, seed: u64) -> Mapper<'a> {
         let model = Model::of_component(input, &self.component);
         let taken = self.component.images.iter().map(|image| image.world_from_camera.is_none()).collect();
         let mut mapper = Mapper::over(params, model, taken, seed);
         mapper.anchors.clone_from(&self.anchors);
-        if mapper.see_again() { mapper.into_part() } else { self }
+        mapper
     }
 }
 
@@ -209,7 +228,7 @@ impl<'a> Parts<'a> {
         let mut report = self.report;
         let mut components = Vec::new();
         for part in self.all {
-            let part = part.without_stray_matches(self.params, self.input, self.seed);
+            let part = part.without_strays(self.params, self.input, self.seed);
             let (component, unheld) = part.seen_again(self.params, self.input, self.seed).without_unheld();
             for image in unheld {
                 let name = &component.images[image.index()].name;

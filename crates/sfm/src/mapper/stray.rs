@@ -9,7 +9,7 @@ use std::collections::BTreeSet;
 
 use rayon::prelude::*;
 
-use super::{Mapper, MapperInput, MapperParams, model::Model, parts::Part, witnesses::count_agreeing};
+use super::{Mapper, model::Model, witnesses::count_agreeing};
 use crate::{ImageId, PairGeometry};
 
 /// Least share of a pair's matches that lies on the circles of images that stand where the pair says.
@@ -17,24 +17,11 @@ const MIN_AGREEING: f64 = 0.8;
 /// Farthest apart, in steps from image to image by pairs that agree, that two images see one thing where their own pair disagrees.
 const MAX_STEPS: usize = 3;
 
-impl Part {
-    /// The part adjusted without what pairs of images far apart tie that disagree with it; as it is where none do.
-    pub fn without_stray_matches(self, params: &MapperParams, input: &MapperInput<'_>, seed: u64) -> Self {
-        let model = Model::of_component(input, &self.component);
-        let strays = stray_pairs(&model, params.max_error_sigma);
-        if !strays.contains(&true) {
-            return self;
-        }
-        let taken = self.component.images.iter().map(|image| image.world_from_camera.is_none()).collect();
-        let mut mapper = Mapper::over(params, model, taken, seed);
-        mapper.anchors.clone_from(&self.anchors);
-        if mapper.leave_out(&strays) == 0 {
-            return self;
-        }
-        mapper.refine(1, 20);
-        mapper.adjust_all(30);
-        mapper.filter_all(params.limits());
-        mapper.into_part()
+impl Mapper<'_> {
+    /// Leaves out the pairs of images far apart that disagree with the model. Returns the observations dropped.
+    pub(super) fn leave_out_strays(&mut self) -> usize {
+        let strays = stray_pairs(&self.model, self.params.max_error_sigma);
+        if strays.contains(&true) { self.leave_out(&strays) } else { 0 }
     }
 }
 
@@ -94,6 +81,7 @@ fn within_steps(next_to: &[Vec<ImageId>], from: ImageId, steps: usize) -> BTreeS
 #[cfg(test)]
 mod tests {
     use super::super::{
+        MapperInput, MapperParams,
         structure::triangulate_image,
         test_street::{POINTS, Street},
     };
@@ -159,13 +147,18 @@ mod tests {
         let lone = of(&mapper, seen(0, alone)).expect("was triangulated");
         mapper.model.remove_point(lone);
         let lone = mapper.model.add_point(position, vec![seen(0, alone), seen(6, too)]);
+        // What no pair tells, a pose did.
+        let found = of(&mapper, seen(1, 2)).expect("was triangulated");
+        mapper.model.remove_point(found);
+        mapper.model.remove_observation(shared, seen(1, matched));
+        mapper.model.add_observation(shared, seen(1, 2));
         let before = mapper.model.observation_count();
-        let strays = stray_pairs(&mapper.model, SIGMAS);
-        assert_eq!(mapper.leave_out(&strays), 3);
+        assert_eq!(mapper.leave_out_strays(), 3);
         assert_eq!(mapper.model.observation_count(), before - 3);
         assert!(mapper.model.point(lone).is_none());
         assert_eq!(of(&mapper, seen(6, wrongly)), None);
         assert_eq!(of(&mapper, seen(0, matched)), Some(shared));
-        assert_eq!(mapper.leave_out(&strays), 0);
+        assert_eq!(of(&mapper, seen(1, 2)), Some(shared));
+        assert_eq!(mapper.leave_out_strays(), 0);
     }
 }

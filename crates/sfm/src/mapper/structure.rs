@@ -1,3 +1,5 @@
+use std::cmp::Reverse;
+
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
@@ -274,35 +276,54 @@ fn drop_observations(model: &mut Model<'_>, judged: Vec<(PointId, bool, Vec<Obse
     dropped
 }
 
-/// Leaves of each point the views that matches still tie together, of several such groups the largest. Returns the observations
-/// dropped.
-pub(super) fn separate(model: &mut Model<'_>, graph: &CorrespondenceGraph) -> usize {
+/// Drops the views of points that only matches of `left_out` tie to the rest, which is what matches of `graph` tie together most of.
+/// Returns the observations dropped.
+///
+/// What no match of either ties, as what was found by a pose is, stays.
+pub(super) fn separate(
+    model: &mut Model<'_>,
+    graph: &CorrespondenceGraph,
+    left_out: &CorrespondenceGraph,
+) -> usize {
     let judge = |&id: &PointId| {
-        let kept = largest_group(&model.point(id)?.track, graph);
-        let gone = |seen: &&Observation| !kept.contains(seen);
-        let gone: Vec<Observation> = model.point(id)?.track.iter().filter(gone).copied().collect();
-        (!gone.is_empty()).then_some((id, kept.len() >= 2, gone))
+        let track = &model.point(id)?.track;
+        let gone = tied_by(left_out, graph, track);
+        (!gone.is_empty()).then_some((id, track.len() - gone.len() >= 2, gone))
     };
     let ids = model.live_ids();
     let judged: Vec<_> = ids.par_iter().with_min_len(POINTS_PER_TASK).filter_map(judge).collect();
     drop_observations(model, judged)
 }
 
-/// The most views of a track that matches tie together, of as many those of the first.
-fn largest_group(track: &[Observation], graph: &CorrespondenceGraph) -> Vec<Observation> {
-    let mut largest = Vec::new();
-    let mut open = track.to_vec();
-    while let Some(first) = (!open.is_empty()).then(|| open.remove(0)) {
-        let mut group = vec![first];
-        let mut next = 0;
+/// The views of a track that `left_out` ties to it and `graph` does not.
+fn tied_by(
+    left_out: &CorrespondenceGraph,
+    graph: &CorrespondenceGraph,
+    track: &[Observation],
+) -> Vec<Observation> {
+    let is_tied = |seen: &Observation| {
+        left_out.partners(seen.image, seen.feature).iter().any(|partner| track.contains(partner))
+    };
+    if !track.iter().any(is_tied) {
+        return Vec::new();
+    }
+    let mut groups = groups(track, graph);
+    groups.sort_by_key(|group| Reverse(group.len()));
+    groups.into_iter().skip(1).filter(|group| group.iter().any(is_tied)).flatten().collect()
+}
+
+/// A track by what matches of `graph` tie together.
+fn groups(track: &[Observation], graph: &CorrespondenceGraph) -> Vec<Vec<Observation>> {
+    let (mut groups, mut open) = (Vec::new(), track.to_vec());
+    while let Some(&first) = open.first() {
+        open.swap_remove(0);
+        let (mut group, mut next) = (vec![first], 0);
         while let Some(seen) = group.get(next) {
             let tied = graph.partners(seen.image, seen.feature);
             group.extend(open.extract_if(.., |other| tied.contains(other)));
             next += 1;
         }
-        if group.len() > largest.len() {
-            largest = group;
-        }
+        groups.push(group);
     }
-    largest
+    groups
 }
