@@ -35,10 +35,8 @@ fn stray_pairs(model: &Model<'_>, max_error_sigma: f64) -> Vec<bool> {
         next_to[pair.first.index()].push(pair.second);
         next_to[pair.second.index()].push(pair.first);
     }
-    let place = connected(&next_to);
     let are_far_apart = |pair: &PairGeometry| {
-        place[pair.first.index()] == place[pair.second.index()]
-            && !within_steps(&next_to, pair.first, MAX_STEPS).contains(&pair.second)
+        steps_between(&next_to, pair.first, pair.second).is_some_and(|steps| steps > MAX_STEPS)
     };
     let is_stray =
         |(pair, agrees): (&PairGeometry, &Option<bool>)| *agrees == Some(false) && are_far_apart(pair);
@@ -53,29 +51,18 @@ fn agrees(model: &Model<'_>, pair: &PairGeometry, max_error_sigma: f64) -> Optio
     Some(agreeing as f64 >= MIN_AGREEING * pair.two_view.inliers.len() as f64)
 }
 
-/// The number of the group that each image is in of those that stand next to each other.
-fn connected(next_to: &[Vec<ImageId>]) -> Vec<usize> {
-    let mut group = vec![usize::MAX; next_to.len()];
-    for start in 0..next_to.len() {
-        let mut open = vec![start];
-        while let Some(at) = open.pop() {
-            if group[at] == usize::MAX {
-                group[at] = start;
-                open.extend(next_to[at].iter().map(|other| other.index()));
-            }
+/// How many steps lead from one image to another; `None` where none do.
+fn steps_between(next_to: &[Vec<ImageId>], from: ImageId, to: ImageId) -> Option<usize> {
+    let (mut reached, mut front, mut steps) = (BTreeSet::from([from]), vec![from], 0);
+    while !front.is_empty() {
+        if reached.contains(&to) {
+            return Some(steps);
         }
-    }
-    group
-}
-
-/// The images that so many steps reach.
-fn within_steps(next_to: &[Vec<ImageId>], from: ImageId, steps: usize) -> BTreeSet<ImageId> {
-    let (mut reached, mut front) = (BTreeSet::from([from]), vec![from]);
-    for _ in 0..steps {
         let beyond = front.iter().flat_map(|at| &next_to[at.index()]).copied();
         front = beyond.filter(|&image| reached.insert(image)).collect();
+        steps += 1;
     }
-    reached
+    None
 }
 
 #[cfg(test)]
