@@ -1,6 +1,7 @@
 //! The image set as one generalized camera, then as photos tied together by their local points.
 
 mod correspondences;
+mod cut;
 mod joint;
 mod merged;
 mod rigid;
@@ -9,6 +10,7 @@ mod sights;
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use nalgebra::Vector2;
 use setloc_sfm::{
     CameraId, ImageId, OutvotedPair, Reconstruction, ReconstructionImage, Rigid, doubtful_images,
 };
@@ -19,6 +21,7 @@ use crate::{
     SetLocalization, Verdict, Views, verdict::standard_deviations,
 };
 
+use cut::doubt_beside_cut;
 use joint::{Component, ComponentAnswer, ComponentPoses};
 
 pub use merged::locate_set_anywhere;
@@ -44,7 +47,11 @@ pub fn locate_set<E>(
     views: impl FnOnce() -> Result<Views, E>,
     seed: u64,
 ) -> Result<SetLocalization, E> {
-    Ok(answer(params, scene, photos, alone, local_models, views, seed)?.finished())
+    let mut found = answer(params, scene, photos, alone, local_models, views, seed)?;
+    let alone: Vec<&PhotoLocalization> =
+        alone.iter().take(photos.len()).map(|evidence| evidence.photo).collect();
+    doubt_beside_cut(&mut found, photos, &alone);
+    Ok(found.finished())
 }
 
 fn answer<E>(
@@ -80,6 +87,8 @@ struct Answer {
     elsewhere: Vec<bool>,
     /// Whether where each photo is rests on a scale that too few matches give.
     lacks_scale: Vec<bool>,
+    /// Where the principal point is of photos that show clearly more of the scene as parts of larger pictures.
+    cut: Vec<Option<Vector2<f64>>>,
     /// What holds each photo: the scene points that it and the photos placed with it see, by photo.
     seen: Vec<Vec<(usize, usize)>>,
 }
@@ -111,7 +120,9 @@ impl Answer {
 
 /// The second answer, which knows more, where anything is localized better in it or has a scale that the first lacks, but for
 /// photos of which that holds the other way round; the first altogether where they contradict each other.
-fn better_of(first: Answer, second: Answer) -> Answer {
+fn better_of(mut first: Answer, mut second: Answer) -> Answer {
+    first.cut = first.cut.iter().zip(&second.cut).map(|(first, second)| first.or(*second)).collect();
+    second.cut.clone_from(&first.cut);
     let pairs = || first.set.refined.iter().zip(&second.set.refined);
     let is_localized = |photo: &PhotoLocalization| photo.verdict == Verdict::Localized;
     let contradicts = |(a, b): (&PhotoLocalization, &PhotoLocalization)| {
@@ -161,6 +172,7 @@ fn locate_by(
     let (mut answer, mut remarks) = (SetLocalization::default(), Vec::new());
     let mut elsewhere = vec![false; photos.len()];
     let mut lacks_scale = vec![false; photos.len()];
+    let mut cut = vec![None; photos.len()];
     let mut seen: Vec<_> = evidence.iter().enumerate().map(|(at, e)| vec![(at, e.photo.inliers)]).collect();
     let mut rigid: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
     let mut refined: Vec<Option<PhotoLocalization>> = vec![None; photos.len()];
@@ -197,6 +209,7 @@ fn locate_by(
                 answer.placed.push(PlacedModel { component, world_from_set });
                 let seen_by_all: Vec<_> = members.iter().copied().zip(found.scene_points.clone()).collect();
                 for (slot, &photo) in members.iter().enumerate() {
+                    cut[photo] = cut[photo].or(found.cut[slot]);
                     scene_links[photo] = scene_links[photo].max(found.scene_points[slot]);
                     keep_better(&mut rigid[photo], found.rigid[slot].clone());
                     if keep_better(&mut refined[photo], found.refined[slot].clone()) {
@@ -234,7 +247,7 @@ fn locate_by(
             photo.reasons.push(format!("its weakest link to the scene shares {} points only", link.shared));
         }
     }
-    Answer { set: answer, remarks, elsewhere, lacks_scale, seen }
+    Answer { set: answer, remarks, elsewhere, lacks_scale, cut, seen }
 }
 
 /// Whether each photo of a local model is localized alone, at the place that the model gives it.
@@ -806,6 +819,7 @@ mod tests {
         Answer {
             elsewhere: vec![false; 2],
             lacks_scale: vec![false; 2],
+            cut: vec![None; 2],
             seen: vec![Vec::new(); 2],
             remarks: vec![Remark { members: vec![0, 1], is_refusal: true, text: "refused".to_owned() }],
             set: SetLocalization {

@@ -7,6 +7,7 @@ use setloc_sfm::Rigid;
 use setloc_sfm::robust::{RansacParams, estimate_absolute_pose};
 
 use self::fit::{Fit, Sought};
+pub(crate) use self::fit::{off_centre, shows_cut};
 use crate::evidence::{PhotoRays, chance_of_inlier, log10_false_alarms, median, occupied_cells, same_pose};
 use crate::guided::guided_matches;
 use crate::misfit::Misfit;
@@ -323,6 +324,7 @@ fn runner_up(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::{UnitQuaternion, Vector2};
     use setloc_features::{Calibration, CameraModel};
 
     use crate::synthetic::{World, along_street};
@@ -342,6 +344,35 @@ mod tests {
         let far = locate(&world, 8);
         assert_eq!(far.verdict, Verdict::NotLocalized, "{far:#?}");
         assert!(far.world_from_camera.is_none() && !far.reasons.is_empty());
+    }
+
+    #[test]
+    fn a_picture_cut_from_a_larger_one_shows_it_where_its_set_has_it_turned_instead() {
+        for seed in 1..4 {
+            let mut world = World::chain(1, 0.2, seed);
+            let matches = world.scene_matches(0);
+            let shows = |world: &World, aside_px: f64| {
+                let view = &world.photos[0];
+                let camera = Camera::from_focal_guess(
+                    world.camera.width,
+                    world.camera.height,
+                    world.camera.focal_length(),
+                );
+                let turn =
+                    UnitQuaternion::from_axis_angle(&Vector3::y_axis(), aside_px / camera.focal_length());
+                let pose = Rigid::new(view.pose.rotation * turn.inverse(), view.pose.translation);
+                let calibration = Calibration::Guessed;
+                let photo = QueryPhoto { name: "", camera: &camera, calibration, features: &view.features };
+                shows_cut(4.0, &world.scene(), &photo, &matches, (&camera, &pose))
+            };
+            assert_eq!(shows(&world, 0.0), None, "{seed}");
+            let aside_px = 0.1 * f64::from(world.camera.width);
+            for keypoint in &mut world.photos[0].features.keypoints {
+                keypoint.x += aside_px as f32;
+            }
+            let aside = shows(&world, aside_px).unwrap_or_else(|| panic!("{seed}"));
+            assert!((aside - Vector2::new(0.1, 0.0)).amax() < 0.03, "{seed}: {aside}");
+        }
     }
 
     #[test]

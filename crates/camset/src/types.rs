@@ -257,6 +257,8 @@ pub struct SetLocalization {
     pub placed: Vec<PlacedModel>,
     /// Names of photos that are localized alone, but at another place than with the set: either is wrong.
     pub contradicted: Vec<String>,
+    /// Names of photos that show that they were cut from larger pictures: of others of their size that is open.
+    pub cut: Vec<String>,
     /// The strongest way from the scene to each photo, one entry a photo.
     pub paths: Vec<PathToScene>,
     /// What happened to each local model, the weakest links and which photo to take next, in sentences.

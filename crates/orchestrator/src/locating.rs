@@ -63,6 +63,11 @@ impl Located {
         best_answers(&self.single, self.set.as_ref())
     }
 
+    /// Whether photos of the set show that they were cut from larger pictures, so that those of one size have no camera in common.
+    fn is_cut(&self) -> bool {
+        self.set.as_ref().is_some_and(|set| !set.cut.is_empty())
+    }
+
     /// How many photos the set localizes, and how many have a pose that is uncertain.
     fn verdicts(&self) -> (usize, usize) {
         let photos = || self.set.iter().flat_map(|set| &set.refined);
@@ -167,17 +172,18 @@ pub fn locate(
             }
         }
         let doubtful = doubtful_guesses(&folder.images, &located, target);
-        if doubtful.contains(&true) {
+        if doubtful.contains(&true) && !located.is_cut() {
             let mut improved = folder.clone();
             whole.absorb(improve_by_model(session, &mut improved.images, &doubtful, what, name)?);
             let mut again = located.clone();
             whole.absorb(run(session, &improved, what, (name, target), (false, true), &mut again)?);
-            if located.divided.contains(&true) || again.verdicts() >= located.verdicts() {
+            let is_better = located.divided.contains(&true) || again.verdicts() >= located.verdicts();
+            if is_better || again.is_cut() {
                 (located, *folder) = (again, improved);
             }
         }
         let images = with_estimated_cameras(&folder.images, &located.divided, located.set.as_ref());
-        if let Some(images) = images {
+        if let Some(images) = images.filter(|_| !located.is_cut()) {
             let calibrated = ImageFolder { images, ..folder.clone() };
             let mut again = Located { set: None, local_models: Vec::new(), ..located.clone() };
             let alone = mode == Mode::Auto;
@@ -185,7 +191,11 @@ pub fn locate(
                 again.single.clear();
             }
             whole.absorb(run(session, &calibrated, what, (name, target), (alone, true), &mut again)?);
-            if again.verdicts() >= located.verdicts() {
+            if again.is_cut() {
+                // Alone photos were sought with a camera that is not theirs.
+                again.single = std::mem::take(&mut located.single);
+                (located, *folder) = (again, calibrated);
+            } else if again.verdicts() >= located.verdicts() {
                 (located, *folder) = (again, calibrated);
             }
         }

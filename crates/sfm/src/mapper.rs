@@ -78,7 +78,7 @@ use self::{
 use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind, bundle::BundleParams};
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 79;
+pub const MAPPER_VERSION: u32 = 80;
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///

@@ -11,7 +11,7 @@ mod walls;
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::{Matrix6, Vector2, Vector3};
 use rayon::prelude::*;
 use setloc_features::{Calibration, Camera};
 use setloc_sfm::{Reconstruction, Rigid, Similarity, WallSight};
@@ -70,6 +70,8 @@ pub(crate) struct ComponentPoses {
     pub refined: Vec<PhotoLocalization>,
     /// Whether it stands elsewhere than where it is localized alone.
     pub elsewhere: Vec<bool>,
+    /// Where the principal point is of those that show clearly more of the scene as parts of larger pictures.
+    pub cut: Vec<Option<Vector2<f64>>>,
     /// Whether too few matches give their scale.
     pub lacks_scale: bool,
     /// Scene points that each photo sees itself.
@@ -327,6 +329,7 @@ impl Component<'_> {
             elsewhere: (refined.iter().zip(elsewhere_alone))
                 .map(|(photo, elsewhere)| elsewhere && photo.world_from_camera.is_some())
                 .collect(),
+            cut: self.cut_pictures(&joint),
             lacks_scale,
             refined,
             remarks,

@@ -1,6 +1,6 @@
 //! The set in all components of a scene: each component's answer, then for each photo the one that says most.
 
-use super::{Answer, Remark, answer};
+use super::{Answer, Remark, answer, cut::doubt_beside_cut};
 use crate::anywhere::{Candidate, choose, is_rival};
 use crate::{
     AnywhereLocalization, CamsetParams, LocalModels, NearestAnywhere, PhotoEvidence, PhotoLocalization,
@@ -37,7 +37,11 @@ pub fn locate_set_anywhere<'a, E>(
             break;
         }
     }
-    Ok(merged(&params.verdict, components, answers).finished())
+    let mut found = merged(&params.verdict, components, answers);
+    let alone: Vec<&PhotoLocalization> =
+        alone.iter().take(found.set.refined.len()).map(|(alone, _)| &alone.photo).collect();
+    doubt_beside_cut(&mut found, photos, &alone);
+    Ok(found.finished())
 }
 
 /// Whether every photo is localized, and none of the components not tried yet supports another place for one.
@@ -78,6 +82,7 @@ fn merged(params: &VerdictParams, components: &[Scene<'_>], mut answers: Vec<Ans
         merged.set.paths.push(answers[at].set.paths[photo].clone());
         merged.elsewhere.push(answers[at].elsewhere[photo]);
         merged.lacks_scale.push(answers[at].lacks_scale[photo]);
+        merged.cut.push(answers.iter().find_map(|answer| answer.cut[photo]));
         merged.seen.push(answers[at].seen[photo].clone());
     }
     for (answer, scene) in answers.into_iter().zip(components) {

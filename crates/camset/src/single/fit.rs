@@ -53,6 +53,11 @@ const FISHEYE_GAIN: f64 = 1.1;
 const BLUR_HALVINGS: [i32; 2] = [7, 5];
 /// How much more a picture that was cut has to explain than one that was not, in matches that agree exactly.
 const CUT_GAIN: f64 = 1.0;
+/// Fewest matches by which a photo of a set shows that it was cut.
+const MIN_SHOWN_CUT: usize = 20;
+/// How much more it has to explain than as its set has it, in matches that agree exactly, and as a share.
+const CUT_LEAD: f64 = 3.0;
+const CUT_LEAD_SHARE: f64 = 0.03;
 /// Share of the longer side from which on no lens has its principal point so far from the middle.
 const OFF_CENTRE: f64 = 0.02;
 
@@ -129,11 +134,11 @@ impl Sought<'_> {
     fn unless_cut(&self, mut usual: Fit) -> Fit {
         let Some(cut) = self.of_cut_picture(&usual) else { return usual };
         let gain = cut.score - usual.score;
-        let least_gain = if is_off_centre(usual.model.camera_of(0)) { -CUT_GAIN } else { CUT_GAIN };
+        let least_gain = if off_centre(usual.model.camera_of(0)).is_some() { -CUT_GAIN } else { CUT_GAIN };
         if gain > least_gain {
             return cut;
         }
-        usual.may_be_cut = gain > 0.0 && is_off_centre(cut.model.camera_of(0));
+        usual.may_be_cut = gain > 0.0 && off_centre(cut.model.camera_of(0)).is_some();
         usual
     }
 
@@ -362,10 +367,37 @@ impl Fit {
     }
 }
 
-/// Whether the principal point is farther from the middle than lenses have it.
-fn is_off_centre(camera: &Camera) -> bool {
+/// Where the principal point is ([`off_centre`]), where matches of a photo of unknown camera, placed so, show clearly that it was cut from the side
+/// of a larger picture.
+///
+/// The photo is fitted from there as one alone is, with the principal point wherever its matches have it, and in the middle: where a
+/// local model is bent, a photo alone explains more than as its set has it, whatever its camera is.
+pub(crate) fn shows_cut(
+    max_error_sigmas: f64,
+    scene: &Scene<'_>,
+    photo: &QueryPhoto<'_>,
+    matches: &[SceneMatch],
+    (camera, pose): (&Camera, &Rigid),
+) -> Option<Vector2<f64>> {
+    let (params, ground) =
+        (SingleParams { max_error_sigmas, ..SingleParams::default() }, Ground::of_scene(scene));
+    let sought = Sought { params: &params, scene, ground: &ground, photo, matches, seed: 0 };
+    let placed = sought.score(&PhotoRays::new(photo.features, camera), pose);
+    let from = Hypothesis { camera: camera.clone(), pose: *pose, score: placed };
+    let usual = sought.fitted(from, KnownOfCamera::Usual);
+    let cut = sought.of_cut_picture(&usual)?;
+    let centred = Hypothesis { camera: camera.centred(), ..usual.hypothesis() };
+    let otherwise = placed.max(sought.fitted(centred, KnownOfCamera::Distortion).score);
+    let is_clear = cut.agreeing.len() >= MIN_SHOWN_CUT
+        && cut.score - otherwise > CUT_LEAD.max(CUT_LEAD_SHARE * otherwise);
+    off_centre(cut.model.camera_of(0)).filter(|_| is_clear)
+}
+
+/// How far the principal point is from the middle, in longer sides, where that is farther than lenses have it.
+pub(crate) fn off_centre(camera: &Camera) -> Option<Vector2<f64>> {
     let size = Vector2::new(f64::from(camera.width), f64::from(camera.height));
-    camera.principal_point().is_some_and(|center| (center - size / 2.0).amax() > OFF_CENTRE * size.max())
+    let aside = (camera.principal_point()? - size / 2.0) / size.max();
+    (aside.amax() > OFF_CENTRE).then_some(aside)
 }
 
 /// The one of greatest score; of equals the last.

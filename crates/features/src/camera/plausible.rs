@@ -5,7 +5,7 @@
 
 use nalgebra::Vector2;
 
-use super::{Camera, CameraModel, Intrinsics, Lens};
+use super::{Camera, CameraModel, Intrinsics, Lens, ParamRole};
 use crate::FeatureError;
 
 /// Focal lengths in units of the longer side: from a circular fisheye in a wide frame to a crop of a 1200 mm lens.
@@ -36,6 +36,19 @@ impl Camera {
     /// Where the optical axis meets the image, in pixels from its upper left corner; panoramas have none.
     pub fn principal_point(&self) -> Option<Vector2<f64>> {
         self.lens().map(|(_, k)| k.center)
+    }
+
+    /// The same camera with its principal point in the middle of the image.
+    #[must_use]
+    pub fn centred(&self) -> Self {
+        let mut centred = self.clone();
+        let mut middle = [self.width, self.height].into_iter().map(|side| f64::from(side) / 2.0);
+        for (value, role) in centred.params.iter_mut().zip(self.param_roles()) {
+            if *role == ParamRole::PrincipalPoint {
+                *value = middle.next().unwrap_or(*value);
+            }
+        }
+        centred
     }
 
     /// The principal point, where it is not in the image, as only crops have it.

@@ -670,8 +670,8 @@ impl<'a> Attempt<'_, '_, 'a> {
         if self.pair_agreement(kept_from_moved) < params.min_pair_agreement {
             return Err(MergeVerdict::PairsDisagree);
         }
-        let is_faint =
-            recognition == Recognition::Likeness && likeness.matched < CLEAR_LIKENESS * likeness.expected;
+        let is_faint = recognition == Recognition::Strength
+            || recognition == Recognition::Likeness && likeness.matched < CLEAR_LIKENESS * likeness.expected;
         if is_faint && self.are_strangers(kept_from_moved) {
             return Err(MergeVerdict::Strangers);
         }

@@ -1,9 +1,11 @@
 //! What a component's poses come to: an answer for each photo.
 
-use std::collections::BTreeMap;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::Vector3;
-use setloc_features::Calibration;
+use nalgebra::{Vector2, Vector3};
+use rayon::prelude::*;
+use setloc_features::{Calibration, CameraModel};
 use setloc_sfm::{ImageId, Rigid};
 
 use super::{Component, Joint};
@@ -11,7 +13,9 @@ use crate::evidence::{PhotoRays, median, same_pose};
 use crate::misfit::Misfit;
 use crate::refine::JointPhoto;
 use crate::set::correspondences::SetCorrespondence;
+use crate::set::cut::Size;
 use crate::set::rigid::RigidPose;
+use crate::single::{shows_cut, union};
 use crate::verdict::{judge_precision, weaker};
 use crate::{PhotoLocalization, SceneMatch, Verdict};
 
@@ -20,6 +24,8 @@ const MIN_KEPT: f64 = 0.5;
 /// Share of the scene points that a photo shows alone that it has to show as its set places it. Of held-out photos of rendered and
 /// real places 0.98 and more are left where the set is right; 0.7 of one that a wrong relative pose drew aside, less of others.
 const MIN_KEPT_OF_ALONE: f64 = 0.8;
+/// Photos of one size that are asked whether they were cut from larger pictures.
+const MOST_ASKED_OF_SIZE: usize = 4;
 /// Scene points that tell the focal length of a photo whose local model does not.
 const MIN_TELLING: usize = 30;
 
@@ -173,6 +179,37 @@ impl Component<'_> {
             misfit.is_clear().then_some((camera, (misfit, photo.name)))
         };
         most.into_iter().filter_map(misfit).collect()
+    }
+
+    /// Where the principal point is of photos that show clearly more of the scene as parts of larger pictures than as their set has them.
+    ///
+    /// Of one [`Size`] those are asked that show most, as what one shows holds for all.
+    pub(super) fn cut_pictures(&self, joint: &Joint) -> Vec<Option<Vector2<f64>>> {
+        let mut of_size: BTreeMap<Size, Vec<usize>> = BTreeMap::new();
+        for slot in 0..self.members.len() {
+            let (photo, camera) = (self.members[slot], joint.model.camera_of(slot));
+            let is_usual = matches!(camera.model, CameraModel::Radial | CameraModel::Opencv);
+            if self.photos[photo].calibration != Calibration::Known && is_usual {
+                of_size.entry(Size::of(self.photos, photo)).or_default().push(slot);
+            }
+        }
+        let asked = of_size.into_values().flat_map(|mut slots| {
+            slots.sort_by_key(|&slot| Reverse(joint.direct[slot].len()));
+            slots.into_iter().take(MOST_ASKED_OF_SIZE)
+        });
+        let asked: BTreeSet<usize> = asked.collect();
+        let cut = |slot: usize| {
+            let (photo, evidence) = (&self.photos[self.members[slot]], &self.evidence[self.members[slot]]);
+            let nearest = &evidence.nearest[..photo.features.own_len().min(evidence.nearest.len())];
+            let own = self.scene.index.correspondences(nearest, self.params.ratio);
+            let own: Vec<SceneMatch> =
+                own.into_iter().map(|c| SceneMatch { feature: c.feature, point: c.point }).collect();
+            let matches = union(&own, &joint.direct[slot]);
+            let placed = (joint.model.camera_of(slot), &joint.model.photos[slot].world_from_camera);
+            shows_cut(self.params.max_error_sigmas, self.scene, photo, &matches, placed)
+        };
+        let slots = (0..self.members.len()).into_par_iter().with_max_len(1);
+        slots.map(|slot| asked.contains(&slot).then(|| cut(slot))?).collect()
     }
 
     /// Whether intrinsics are known, shared with another photo of the model or told by its points.
