@@ -363,7 +363,8 @@ mod tests {
                 let pose = Rigid::new(view.pose.rotation * turn.inverse(), view.pose.translation);
                 let calibration = Calibration::Guessed;
                 let photo = QueryPhoto { name: "", camera: &camera, calibration, features: &view.features };
-                shows_cut(4.0, &world.scene(), &photo, &matches, (&camera, &pose))
+                let scene = world.scene();
+                shows_cut(4.0, (&scene, &Ground::of_scene(&scene)), &photo, &matches, (&camera, &pose))
             };
             assert_eq!(shows(&world, 0.0), None, "{seed}");
             let aside_px = 0.1 * f64::from(world.camera.width);

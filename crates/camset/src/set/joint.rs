@@ -329,7 +329,7 @@ impl Component<'_> {
             elsewhere: (refined.iter().zip(elsewhere_alone))
                 .map(|(photo, elsewhere)| elsewhere && photo.world_from_camera.is_some())
                 .collect(),
-            cut: self.cut_pictures(&joint),
+            cut: self.cut_pictures(&joint, &ground),
             lacks_scale,
             refined,
             remarks,

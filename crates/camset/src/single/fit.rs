@@ -374,14 +374,13 @@ impl Fit {
 /// local model is bent, a photo alone explains more than as its set has it, whatever its camera is.
 pub(crate) fn shows_cut(
     max_error_sigmas: f64,
-    scene: &Scene<'_>,
+    (scene, ground): (&Scene<'_>, &Ground),
     photo: &QueryPhoto<'_>,
     matches: &[SceneMatch],
     (camera, pose): (&Camera, &Rigid),
 ) -> Option<Vector2<f64>> {
-    let (params, ground) =
-        (SingleParams { max_error_sigmas, ..SingleParams::default() }, Ground::of_scene(scene));
-    let sought = Sought { params: &params, scene, ground: &ground, photo, matches, seed: 0 };
+    let params = SingleParams { max_error_sigmas, ..SingleParams::default() };
+    let sought = Sought { params: &params, scene, ground, photo, matches, seed: 0 };
     let placed = sought.score(&PhotoRays::new(photo.features, camera), pose);
     let from = Hypothesis { camera: camera.clone(), pose: *pose, score: placed };
     let usual = sought.fitted(from, KnownOfCamera::Usual);

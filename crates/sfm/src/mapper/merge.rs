@@ -670,8 +670,11 @@ impl<'a> Attempt<'_, '_, 'a> {
         if self.pair_agreement(kept_from_moved) < params.min_pair_agreement {
             return Err(MergeVerdict::PairsDisagree);
         }
-        let is_faint = recognition == Recognition::Strength
-            || recognition == Recognition::Likeness && likeness.matched < CLEAR_LIKENESS * likeness.expected;
+        let is_faint = match recognition {
+            Recognition::Likeness => likeness.matched < CLEAR_LIKENESS * likeness.expected,
+            Recognition::Strength => !outweighs_walls(*support, likeness.expected, MIN_STRENGTH),
+            Recognition::Neighbours => false,
+        };
         if is_faint && self.are_strangers(kept_from_moved) {
             return Err(MergeVerdict::Strangers);
         }
@@ -1065,5 +1068,7 @@ mod tests {
         assert!(alone(106, 473.0) && alone(195, 346.0));
         assert!(!alone(62, 428.0) && !alone(60, 1321.0) && !alone(30, 50.0));
         assert!(!alone(100, 0.0), "nothing is expected, so nothing is known");
+        // Of a town of equal façades, 7.5 steps aside: strong by its pairs, so that strangers have to be asked for.
+        assert!(of_pairs(226, 2220.0) && !alone(226, 2220.0));
     }
 }

@@ -16,6 +16,7 @@ use crate::set::correspondences::SetCorrespondence;
 use crate::set::cut::Size;
 use crate::set::rigid::RigidPose;
 use crate::single::{shows_cut, union};
+use crate::underfoot::Ground;
 use crate::verdict::{judge_precision, weaker};
 use crate::{PhotoLocalization, SceneMatch, Verdict};
 
@@ -184,7 +185,7 @@ impl Component<'_> {
     /// Where the principal point is of photos that show clearly more of the scene as parts of larger pictures than as their set has them.
     ///
     /// Of one [`Size`] those are asked that show most, as what one shows holds for all.
-    pub(super) fn cut_pictures(&self, joint: &Joint) -> Vec<Option<Vector2<f64>>> {
+    pub(super) fn cut_pictures(&self, joint: &Joint, ground: &Ground) -> Vec<Option<Vector2<f64>>> {
         let mut of_size: BTreeMap<Size, Vec<usize>> = BTreeMap::new();
         for slot in 0..self.members.len() {
             let (photo, camera) = (self.members[slot], joint.model.camera_of(slot));
@@ -206,7 +207,7 @@ impl Component<'_> {
                 own.into_iter().map(|c| SceneMatch { feature: c.feature, point: c.point }).collect();
             let matches = union(&own, &joint.direct[slot]);
             let placed = (joint.model.camera_of(slot), &joint.model.photos[slot].world_from_camera);
-            shows_cut(self.params.max_error_sigmas, self.scene, photo, &matches, placed)
+            shows_cut(self.params.max_error_sigmas, (self.scene, ground), photo, &matches, placed)
         };
         let slots = (0..self.members.len()).into_par_iter().with_max_len(1);
         slots.map(|slot| asked.contains(&slot).then(|| cut(slot))?).collect()
