@@ -29,7 +29,7 @@ impl Size {
     }
 }
 
-/// Photos of sizes that few have that have to show it, unless one is localized alone as such.
+/// Photos of sizes that few have that have to show it; one may be the only one that somebody cut.
 const MIN_CUT: usize = 2;
 /// How far from where it is a principal point may be sought, in longer sides: alone, and beside a set. Ten photos alone were right to
 /// 0.003; beside sets some were 0.05 off.
@@ -53,12 +53,13 @@ impl Witness {
     }
 }
 
-/// Whether photos of a size were not cut alike, by those that show that they were cut.
-fn are_cut_apart(size: Size, witnesses: &[&Witness]) -> bool {
+/// Whether photos of a size were not cut alike, by those that show that they were cut, and by how many are localized alone and show
+/// that they were not.
+fn are_cut_apart(size: Size, witnesses: &[&Witness], num_whole: usize) -> bool {
     if size.0.is_some() {
         witnesses.iter().any(|one| witnesses.iter().any(|other| one.contradicts(other)))
     } else {
-        witnesses.len() >= MIN_CUT || witnesses.iter().any(|witness| witness.is_alone)
+        witnesses.len() >= num_whole.max(MIN_CUT)
     }
 }
 
@@ -82,7 +83,15 @@ pub(super) fn doubt_beside_cut(answer: &mut Answer, photos: &[QueryPhoto<'_>], a
     for witness in &witnesses {
         by_size.entry(sizes[witness.photo]).or_default().push(witness);
     }
-    by_size.retain(|size, witnesses| are_cut_apart(*size, witnesses));
+    by_size.retain(|size, witnesses| {
+        let is_whole = |at: &usize| {
+            sizes[*at] == *size
+                && is_open(*at)
+                && is_sought_alone(*at)
+                && off_centre(&alone[*at].camera).is_none()
+        };
+        are_cut_apart(*size, witnesses, (0..alone.len()).filter(is_whole).count())
+    });
     for witness in witnesses.iter().filter(|witness| !witness.is_alone) {
         for photo in [&mut answer.set.refined[witness.photo], &mut answer.set.rigid[witness.photo]] {
             photo.doubt(
@@ -222,7 +231,8 @@ mod tests {
         assert_eq!(beside([0.0, 0.0, 0.0, 0.0, 0.1, 0.0]), "LLLLUL");
         let mut alone = all_uncertain();
         alone[4] = moved_aside(photo(4, Verdict::Localized), 0.1);
-        let found = doubted(&alone, [0.0; 6]);
-        assert_eq!((&*verdicts(&found.refined), &*found.cut), ("LLLLLU", &["4".to_owned()][..]));
+        assert_eq!(verdicts(&doubted(&alone, [0.0; 6]).refined), "LLLLLL");
+        let found = doubted(&alone, [0.0, 0.0, 0.0, 0.0, 0.0, 0.1]);
+        assert_eq!((&*verdicts(&found.refined), &*found.cut), ("LLLLLU", &["4", "5"].map(str::to_owned)[..]));
     }
 }
