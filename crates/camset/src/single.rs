@@ -67,12 +67,7 @@ pub(crate) fn locate_with_nearest(
     let refused = |photo| SingleAnswer { photo, inliers: Vec::new() };
     // Simulated views tie photos to each other, and help once a pose is known. Before, they add less to a scene of which
     // each point was seen from several sides than the chance matches of so many more features take away.
-    let matches: Vec<SceneMatch> = scene
-        .index
-        .correspondences(&nearest[..photo.features.own_len()], params.ratio)
-        .into_iter()
-        .map(|c| SceneMatch { feature: c.feature, point: c.point })
-        .collect();
+    let matches = own_matches(scene.index, photo, nearest, params.ratio);
     if matches.len() < params.verdict.min_inliers {
         let reason = format!(
             "{} of its features resemble a scene point, at least {} must",
@@ -127,6 +122,17 @@ pub(crate) fn locate_with_nearest(
         reasons,
     };
     SingleAnswer { photo: answer, inliers: found.inliers }
+}
+
+/// What a photo's own features, without their simulated views, are matched with by the ratio test.
+pub(crate) fn own_matches(
+    index: &SceneIndex,
+    photo: &QueryPhoto<'_>,
+    nearest: &[NearestPoints],
+    ratio: f64,
+) -> Vec<SceneMatch> {
+    let found = index.correspondences(&nearest[..photo.features.own_len()], ratio);
+    found.into_iter().map(|c| SceneMatch { feature: c.feature, point: c.point }).collect()
 }
 
 fn solve(

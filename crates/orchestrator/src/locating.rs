@@ -193,9 +193,9 @@ pub fn locate(
             whole.absorb(run(session, &calibrated, what, (name, target), (alone, true), &mut again)?);
             if again.is_cut() {
                 // Alone photos were sought with a camera that is not theirs.
-                again.single = std::mem::take(&mut located.single);
-                (located, *folder) = (again, calibrated);
-            } else if again.verdicts() >= located.verdicts() {
+                again.single.clone_from(&located.single);
+            }
+            if again.is_cut() || again.verdicts() >= located.verdicts() {
                 (located, *folder) = (again, calibrated);
             }
         }

@@ -3,18 +3,20 @@
 //! Photos of one size are taken for one camera's, whose principal point is about in the middle. Where each was cut from a larger
 //! picture, or is a frame of a video that was steadied, its own turn and step aside make up for that: a local model holds together and fits
 //! the scene, metres off. A photo that is localized alone, or that shows clearly more of the scene as a part of a larger picture, tells that
-//! it was cut. What of the others is not told is not known then.
+//! it was cut. Where the others were cut is not known then.
 
 use std::collections::BTreeMap;
 
 use nalgebra::Vector2;
 use setloc_features::Calibration;
+use setloc_sfm::listed;
 
 use super::{Answer, Remark};
 use crate::{PhotoLocalization, QueryPhoto, Verdict, single::off_centre};
 
 /// Photos of one size from which on they are taken for one camera's, cut alike or not at all.
 const MIN_OF_SIZE: usize = 3;
+
 /// Which photos of a set may be one camera's by their sizes in pixels: those of one size, and all those of a size that few have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Size(Option<[u32; 2]>);
@@ -106,13 +108,9 @@ pub(super) fn doubt_beside_cut(answer: &mut Answer, photos: &[QueryPhoto<'_>], a
     if cut.is_empty() {
         return;
     }
-    let in_doubt: Vec<usize> =
-        (0..alone.len()).filter(|&at| is_open(at) && by_size.contains_key(&sizes[at])).collect();
-    let names: Vec<&str> = cut.iter().take(MOST_NAMED).map(|&at| photos[at].name).collect();
-    let more = cut.len().saturating_sub(MOST_NAMED);
-    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-    let shown_by = format!("{}{more}", names.join(", "));
-    for at in in_doubt {
+    let names: Vec<&str> = cut.iter().map(|&at| photos[at].name).collect();
+    let shown_by = listed(&names, MOST_NAMED);
+    for at in (0..alone.len()).filter(|&at| is_open(at) && by_size.contains_key(&sizes[at])) {
         if is_sought_alone(at) {
             let mut own = alone[at].clone();
             own.reasons.push(format!("photos of its set were cut from larger pictures, as {shown_by} show: its place is that of the photo alone"));
@@ -125,7 +123,7 @@ pub(super) fn doubt_beside_cut(answer: &mut Answer, photos: &[QueryPhoto<'_>], a
         }
         answer.set.rigid[at].doubt("photos of its set were cut from larger pictures".to_owned());
     }
-    answer.set.cut = cut.iter().map(|&at| photos[at].name.to_owned()).collect();
+    answer.set.cut = names.into_iter().map(str::to_owned).collect();
     answer.remarks.push(Remark {
         members: cut,
         is_refusal: false,

@@ -15,7 +15,7 @@ use crate::refine::JointPhoto;
 use crate::set::correspondences::SetCorrespondence;
 use crate::set::cut::Size;
 use crate::set::rigid::RigidPose;
-use crate::single::{shows_cut, union};
+use crate::single::{own_matches, shows_cut, union};
 use crate::underfoot::Ground;
 use crate::verdict::{judge_precision, weaker};
 use crate::{PhotoLocalization, SceneMatch, Verdict};
@@ -201,10 +201,7 @@ impl Component<'_> {
         let asked: BTreeSet<usize> = asked.collect();
         let cut = |slot: usize| {
             let (photo, evidence) = (&self.photos[self.members[slot]], &self.evidence[self.members[slot]]);
-            let nearest = &evidence.nearest[..photo.features.own_len().min(evidence.nearest.len())];
-            let own = self.scene.index.correspondences(nearest, self.params.ratio);
-            let own: Vec<SceneMatch> =
-                own.into_iter().map(|c| SceneMatch { feature: c.feature, point: c.point }).collect();
+            let own = own_matches(self.scene.index, photo, evidence.nearest, self.params.ratio);
             let matches = union(&own, &joint.direct[slot]);
             let placed = (joint.model.camera_of(slot), &joint.model.photos[slot].world_from_camera);
             shows_cut(self.params.max_error_sigmas, (self.scene, ground), photo, &matches, placed)
