@@ -83,7 +83,7 @@ pub use views::{ViewGeometry, ViewMatch, ViewParams, Views, likely_images, match
 /// 55: photos alone that were cut from the side of a larger picture are found as such. 56: those that may be stay doubtful at another
 /// focal length; far points end no adjustment.
 /// 58: sets of photos that were cut apart are in doubt.
-pub const VERSION: u32 = 58;
+pub const VERSION: u32 = 59;
 
 /// Version of what localized photos add to a scene; bumped whenever equal inputs give another growth.
 /// 2: points shift to where moved rays meet.

@@ -10,7 +10,7 @@ use crate::Scene;
 use crate::common_turn::CommonTurn;
 use crate::evidence::PhotoRays;
 use crate::jackknife::honest_covariances;
-use crate::stretch::Freed;
+use crate::stretch::{Costs, Freed};
 
 mod model;
 mod noise;
@@ -111,7 +111,12 @@ fn adjust(
             return;
         }
     }
-    if model.stretch.is_worth(&freed, as_told.final_cost, report.final_cost) {
+    let costs = |problem: &BundleProblem, total: f64| {
+        let by_pose = noise::costs(problem, params.loss);
+        Costs { total, by_pose: slots.iter().map(|&slot| by_pose[slot]).collect() }
+    };
+    let [told, freely] = [costs(problem, as_told.final_cost), costs(&stretched, report.final_cost)];
+    if model.stretch.is_worth(&freed, &told, &freely) {
         *problem = stretched;
         model.stretch.note(problem, &freed);
     }

@@ -17,7 +17,7 @@ const MIN_WEIGHT: f64 = 2.0;
 pub(crate) fn estranged(
     component: &Reconstruction,
     larger: &[Reconstruction],
-    pairs: &[PairGeometry],
+    pairs: &[&PairGeometry],
     most_shared: impl Fn(ImageId) -> usize,
 ) -> Vec<OutvotedPair> {
     let is_in = |of: &Reconstruction, image: ImageId| of.images[image.index()].world_from_camera.is_some();
@@ -86,7 +86,7 @@ mod tests {
             two_view: TwoView::of_equal_features(Rigid::identity(), 0..matches),
         };
         let found = |at: usize, pairs: &[PairGeometry]| {
-            assess(&QualityParams::default(), &components[at], &components[..at], pairs).outvoted
+            assess(&QualityParams::default(), &components[at], &components[..at], pairs, &[]).outvoted
         };
         assert_eq!(found(1, &[pair(1, 3, 140), pair(3, 4, 90)]), []);
         let strangers = found(1, &[pair(1, 3, 140), pair(0, 3, 336), pair(3, 4, 90)]);

@@ -36,7 +36,8 @@ pub use ground::{register_by_ground, sharpen_lengths};
 pub use listing::{MOST_NAMED, listed};
 pub use mapper::{
     CorrectedCamera, InputImage, MAPPER_VERSION, MapperInput, MapperOutput, MapperParams, MapperReport,
-    MergeRecord, MergeVerdict, Mosaic, PutativePair, Recognition, RegistrationRecord, reconstruct,
+    MergeRecord, MergeVerdict, Mosaic, PutativePair, Recognition, RegistrationRecord, pairs_underfoot,
+    reconstruct,
 };
 pub use model_errors::{BearingField, ModelErrors, PoseDeviation, shared_sigma_of_matches};
 pub use quality::{

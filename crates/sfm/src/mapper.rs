@@ -51,6 +51,7 @@ pub use self::{
     merge::{MergeRecord, MergeVerdict, Recognition},
     output::{CorrectedCamera, MapperOutput, MapperReport, RegistrationRecord},
     params::MapperParams,
+    repeated::pairs_underfoot,
     standpoint::Mosaic,
 };
 
@@ -78,7 +79,7 @@ use self::{
 use crate::{BaselineLength, ImageId, Observation, PairGeometry, Rigid, TwoViewKind, bundle::BundleParams};
 
 /// Bumped when equal inputs and parameters give another model.
-pub const MAPPER_VERSION: u32 = 80;
+pub const MAPPER_VERSION: u32 = 81;
 
 /// Builds all components from verified pairs, largest first; those that a similarity is supported between become one.
 ///

@@ -208,11 +208,16 @@ pub struct QualityReport {
 }
 
 /// Compares a component with the verified pairs that it and the larger ones were built from.
+///
+/// `is_underfoot` tells of which pairs paving is all that they explain ([`crate::pairs_underfoot`]), none beyond its end: those agree, or
+/// say nothing. A street's paving repeats itself exactly where it is rendered, and two panoramas far from each other have up to 1600
+/// matches there.
 pub fn assess(
     params: &QualityParams,
     reconstruction: &Reconstruction,
     larger: &[Reconstruction],
     pairs: &[PairGeometry],
+    is_underfoot: &[bool],
 ) -> QualityReport {
     let n = reconstruction.images.len();
     let mut report = QualityReport {
@@ -223,7 +228,12 @@ pub fn assess(
     let views = CommonViews::of(reconstruction);
     // Of the geometries of one pair the model can have one only.
     let mut judged: BTreeMap<(ImageId, ImageId), (PairDisagreement, bool)> = BTreeMap::new();
-    for pair in pairs {
+    let mut telling = Vec::with_capacity(pairs.len());
+    for (at, pair) in pairs.iter().enumerate() {
+        let is_underfoot = is_underfoot.get(at) == Some(&true);
+        if !is_underfoot {
+            telling.push(pair);
+        }
         let poses = (
             reconstruction.images[pair.first.index()].world_from_camera,
             reconstruction.images[pair.second.index()].world_from_camera,
@@ -248,6 +258,9 @@ pub fn assess(
         let is_mere_turn =
             two_view.kind == TwoViewKind::PureRotation && found.rotation_deg <= params.max_rotation_deg;
         let agrees = is_mere_turn || !found.is_unused() && !is_turned;
+        if is_underfoot && !agrees {
+            continue;
+        }
         let (kept, any_agrees) =
             judged.entry((pair.first, pair.second)).or_insert_with(|| (found.clone(), false));
         *any_agrees |= agrees;
@@ -263,7 +276,7 @@ pub fn assess(
     let heavy: Vec<&PairDisagreement> = report.disagreements.iter().filter(|pair| pair.is_heavy()).collect();
     let contradicted: BTreeSet<ImageId> = heavy.iter().flat_map(|pair| [pair.first, pair.second]).collect();
     report.outvoted = heavy.into_iter().filter_map(|pair| outvoted(pair, &spots, &links)).collect();
-    report.outvoted.extend(estranged(reconstruction, larger, pairs, |image| views.most_shared(image)));
+    report.outvoted.extend(estranged(reconstruction, larger, &telling, |image| views.most_shared(image)));
     let is_near =
         |seen: usize, by: ImageId| seen as f64 >= params.min_expected_share * views.points_of(by) as f64;
     for (first, second) in views.expecting() {
@@ -610,31 +623,31 @@ mod tests {
                 covariance: None,
             });
         }
-        let report = assess(&QualityParams::default(), &model, &[], &[]);
+        let report = assess(&QualityParams::default(), &model, &[], &[], &[]);
         assert_eq!(report.suspicious.len(), 1, "{report:?}");
         assert!(report.sentences(&model)[0].starts_with("a and b stand together"));
         assert!(!report.suspicious[0].is_confirmed);
         let two_view = TwoView::of_equal_features(Rigid::identity(), 0..60);
         let pair = PairGeometry { first: ImageId(0), second: ImageId(1), two_view };
-        assert!(assess(&QualityParams::default(), &model, &[], &[pair]).suspicious[0].is_confirmed);
+        assert!(assess(&QualityParams::default(), &model, &[], &[pair], &[]).suspicious[0].is_confirmed);
         // So does a third that shares nothing with either.
         let mut three = model.clone();
         three.images.push(image("c", 0.2));
         for (at, point) in three.points.iter_mut().enumerate() {
             point.track[0].image = ImageId(at as u32 % 3);
         }
-        let suspicious = assess(&QualityParams::default(), &three, &[], &[]).suspicious;
+        let suspicious = assess(&QualityParams::default(), &three, &[], &[], &[]).suspicious;
         assert!(suspicious.len() == 3 && suspicious.iter().all(|pair| pair.is_confirmed), "{suspicious:?}");
         // What the second sees is at its feet, which the first sees from elsewhere: a wall may part them.
         let mut beside = model.clone();
         for point in beside.points.iter_mut().filter(|point| point.track[0].image == ImageId(1)) {
             point.position = point.position * 0.025 + Vector3::x() * 0.1;
         }
-        assert_eq!(assess(&QualityParams::default(), &beside, &[], &[]).suspicious, []);
+        assert_eq!(assess(&QualityParams::default(), &beside, &[], &[], &[]).suspicious, []);
         // Turned away, neither ought to see what the other does.
         let turned = UnitQuaternion::from_euler_angles(0.0, std::f64::consts::PI, 0.0);
         model.images[1].world_from_camera = Some(Rigid::new(turned, Vector3::new(0.1, 0.0, 0.0)));
-        assert_eq!(assess(&QualityParams::default(), &model, &[], &[]).suspicious, []);
+        assert_eq!(assess(&QualityParams::default(), &model, &[], &[], &[]).suspicious, []);
     }
 
     #[test]
@@ -750,7 +763,7 @@ mod tests {
     }
 
     #[test]
-    fn what_photos_turned_on_the_spot_share_speaks_against_nothing() {
+    fn what_photos_turned_on_the_spot_share_and_paving_speak_against_nothing() {
         let mut model = Reconstruction {
             cameras: vec![Camera::equirectangular(200, 100)],
             images: vec![image("a", 0.0), image("b", 0.0), image("c", 1.0)],
@@ -768,16 +781,18 @@ mod tests {
                 covariance: None,
             });
         }
-        let report = |kind| {
+        let report = |kind, is_underfoot| {
             let inliers = (0..300).map(|at| Match { first: at, second: at }).collect();
             let two_view =
                 TwoView { kind, second_from_first: Rigid::identity(), inliers, median_parallax_rad: 0.0 };
             let pair = PairGeometry { first: ImageId(0), second: ImageId(1), two_view };
-            assess(&QualityParams::default(), &model, &[], &[pair])
+            assess(&QualityParams::default(), &model, &[], &[pair], &[is_underfoot])
         };
-        let of_turn = report(TwoViewKind::PureRotation);
+        let of_turn = report(TwoViewKind::PureRotation, false);
         assert_eq!((of_turn.disagreements, of_turn.outvoted), (vec![], vec![]));
-        let found = report(TwoViewKind::General).outvoted;
+        let of_paving = report(TwoViewKind::General, true);
+        assert_eq!((of_paving.pairs, of_paving.disagreements, of_paving.outvoted), (0, vec![], vec![]));
+        let found = report(TwoViewKind::General, false).outvoted;
         assert_eq!(found.iter().map(|pair| (pair.matches, pair.held_by)).collect::<Vec<_>>(), [(300, 9)]);
     }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use nalgebra::Matrix3;
-use setloc_sfm::bundle::{self, BundleObservation, BundleParams, BundlePose, BundleProblem};
+use setloc_sfm::bundle::{self, BundleObservation, BundleParams, BundlePose, BundleProblem, RobustLoss};
 
 use super::Origin;
 use crate::evidence::ray_error_sigmas;
@@ -34,6 +34,17 @@ pub(super) fn leave_out_strays(problem: &mut BundleProblem, origins: &mut Vec<Or
         .map(|(seen, origin)| (*seen, *origin))
         .collect();
     (problem.observations, *origins) = kept.into_iter().unzip();
+}
+
+/// What the observations of each pose cost.
+pub(super) fn costs(problem: &BundleProblem, loss: RobustLoss) -> Vec<f64> {
+    let mut costs = vec![0.0; problem.poses.len()];
+    for seen in &problem.observations {
+        if let Some(error) = error_sigmas(problem, seen) {
+            costs[seen.pose as usize] += loss.evaluate(error * error).0 / 2.0;
+        }
+    }
+    costs
 }
 
 /// How far the point of an observation is from where it is seen, in standard deviations of the place; `None` where the

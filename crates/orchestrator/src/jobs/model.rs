@@ -9,7 +9,7 @@ use setloc_features::{Calibration, Camera, ImageFeatures, Match};
 use setloc_sfm::{
     CameraId, Georegistration, ImageId, InputImage, MOST_NAMED, MapperInput, MapperOutput, MapperParams,
     MeasuredPosition, PairGeometry, PutativePair, QualityParams, QualityReport, Reconstruction,
-    TwoViewParams, assess, listed, reconstruct,
+    TwoViewParams, assess, listed, pairs_underfoot, reconstruct,
 };
 
 use super::alignment::{KnownOfModel, add_alignment};
@@ -252,7 +252,7 @@ fn run_model(
             features.push((at, found));
         }
     }
-    let mut pairs = verified_of(inputs, input.pairs, &id_of)?;
+    let pairs = verified_of(inputs, input.pairs, &id_of)?;
     let mut putative = Vec::new();
     for pair in input.pairs {
         let matches = inputs.find::<PairMatches>(&matches_role(pair))?;
@@ -280,12 +280,15 @@ fn run_model(
     if params.continue_planes {
         output.open_pairs = output.open_among(&pairs);
     }
+    let underfoot = pairs_underfoot(&input_of_mapper);
     // What two copies of an image share tells nothing of where they stand, and few of its matches become points.
     let contents: Vec<ContentHash> =
         features.iter().map(|(at, _)| inputs.hash(&features_role(*at))).collect::<Result<_>>()?;
-    pairs.retain(|pair| contents[pair.first.index()] != contents[pair.second.index()]);
+    let are_copies = |pair: &PairGeometry| contents[pair.first.index()] == contents[pair.second.index()];
+    let (pairs, underfoot): (Vec<PairGeometry>, Vec<bool>) =
+        pairs.into_iter().zip(underfoot).filter(|(pair, _)| !are_copies(pair)).unzip();
     let assessed = |components: &[Reconstruction]| -> Vec<QualityReport> {
-        let report = |at: usize| assess(quality, &components[at], &components[..at], &pairs);
+        let report = |at: usize| assess(quality, &components[at], &components[..at], &pairs, &underfoot);
         (0..components.len()).map(report).collect()
     };
     let mut reports = assessed(&output.components);

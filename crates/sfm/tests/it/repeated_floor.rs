@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use setloc_features::{Calibration, Camera, CameraModel, ImageFeatures, Keypoint, Match, Posture};
 use setloc_sfm::{
     CameraId, ImageId, InputImage, MapperInput, MapperOutput, MapperParams, PairGeometry, PutativePair,
-    Rigid, Similarity, TwoViewParams, reconstruct, verify_pair,
+    Rigid, Similarity, TwoViewParams, pairs_underfoot, reconstruct, verify_pair,
 };
 
 const TILE_M: f64 = 0.8;
@@ -143,6 +143,10 @@ impl Room {
     }
 
     fn map(&self, matching: &Matching) -> MapperOutput {
+        self.with_input(matching, |input| reconstruct(&MapperParams::default(), input, 5))
+    }
+
+    fn with_input<R>(&self, matching: &Matching, run: impl FnOnce(&MapperInput<'_>) -> R) -> R {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let rays: Vec<_> = self.features.iter().map(|features| features.rays(&self.camera)).collect();
         let names: Vec<String> = (0..rays.len()).map(|at| format!("image_{at}")).collect();
@@ -165,7 +169,17 @@ impl Room {
             putative: &putative,
             two_view: TwoViewParams::default(),
         };
-        reconstruct(&MapperParams::default(), &input, 5)
+        run(&input)
+    }
+
+    /// The share of a pair's matches that lie on the floor in both images.
+    fn share_of_floor(&self, pair: &PairGeometry) -> f64 {
+        let is_floor = |image: ImageId, feature: u32| {
+            matches!(self.seen[image.index()][feature as usize], Seen::Floor { .. })
+        };
+        let matches = &pair.two_view.inliers;
+        let on_floor = |m: &&Match| is_floor(pair.first, m.first) && is_floor(pair.second, m.second);
+        matches.iter().filter(on_floor).count() as f64 / matches.len() as f64
     }
 
     /// The images that are not registered, and the largest error of a centre in metres.
@@ -235,6 +249,27 @@ fn a_panorama_whose_floor_agrees_with_what_walls_there_are_comes_back() {
     assert!(says_so(&output, "underfoot only"));
     let (lost, error) = room.judge(&output);
     assert!(lost.is_empty() && error < 0.03, "{lost:?}, {error} m");
+}
+
+#[test]
+fn pairs_that_explain_nothing_but_the_floor_are_told_from_those_that_explain_walls_too() {
+    let room = Room::new();
+    for (wall, are_tiles_alike) in [(0.3, true), (0.9, true), (0.9, false)] {
+        let matching = Matching { are_tiles_alike, wall, ..MOSTLY_FLOOR };
+        let (found, walls) = room.with_input(&matching, |input| {
+            let judged: Vec<(bool, f64)> = (pairs_underfoot(input).into_iter())
+                .zip(input.pairs.iter().map(|pair| room.share_of_floor(pair)))
+                .collect();
+            assert_eq!(judged.len(), input.pairs.len());
+            for (is_underfoot, share) in &judged {
+                assert!(!is_underfoot || *share > 0.5, "{share} of the matches of such a pair");
+                assert!(*is_underfoot || *share < 0.97, "{share} of the matches of another");
+            }
+            let found = judged.iter().filter(|(is_underfoot, _)| *is_underfoot).count();
+            (found, judged.len() - found)
+        });
+        assert!(walls >= 6 && (found > 0) == are_tiles_alike, "{wall} {are_tiles_alike}: {found}, {walls}");
+    }
 }
 
 #[test]
