@@ -325,7 +325,7 @@ fn refuse_inputs(source: &SourceArgs, files: &[(String, PathBuf)], export: &Path
 }
 
 /// The scene whose exports are in a folder.
-fn reported_scene(folder: &Path) -> Option<ContentHash> {
+pub fn reported_scene(folder: &Path) -> Option<ContentHash> {
     let report: Value = serde_json::from_slice(&std::fs::read(folder.join(REPORT)).ok()?).ok()?;
     serde_json::from_value(report["scene"].clone()).ok()
 }

@@ -233,3 +233,20 @@ fn data_that_cannot_be_written_is_an_error_unless_nobody_reads_on() {
         assert_eq!(output.status.code(), Some(0), "{command:?}: {}", said(&output));
     }
 }
+
+#[test]
+fn a_scene_is_reported_by_no_results_of_another() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 3);
+    let run = |arguments: &[&str]| setloc(folder.path(), arguments);
+    assert_eq!(run(&["build", "panoramas", "-o", "s.setloc"]).status.code(), Some(1));
+    assert_eq!(run(&["report", "s.setloc"]).status.code(), Some(0));
+    std::fs::remove_file(folder.path().join("panoramas/p2.png")).unwrap();
+    let other = ["build", "panoramas", "-o", "s.setloc", "--set", "sfm.loss_sigma=1.5", "--export", "other"];
+    assert_eq!(run(&other).status.code(), Some(1));
+    let refused = run(&["report", "s.setloc"]);
+    assert_eq!(refused.status.code(), Some(2), "{}", gave(&refused));
+    let text = said(&refused);
+    assert!(text.contains("error: s has no results of the scene s.setloc\nhint: "), "{text}");
+    assert_eq!(run(&["report", "other"]).status.code(), Some(0));
+}
