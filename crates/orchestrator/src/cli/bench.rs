@@ -1,3 +1,5 @@
+mod own_stores;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -22,11 +24,30 @@ use crate::html::page;
 use crate::print;
 use crate::store::{create_folder, write_atomically};
 
+use own_stores::OwnStores;
+
 /// `setloc bench`
 pub fn run(args: &BenchArgs) -> Result<Answer> {
-    if args.datasets.is_empty() {
-        return run_registry(args);
+    let mut stores = OwnStores::default();
+    let answer = if args.datasets.is_empty() {
+        run_registry(args, &mut stores)
+    } else {
+        run_datasets(args, &mut stores)
+    };
+    // Where the run ended before its time, the same command goes on with them.
+    if !answer.as_ref().is_err_and(ends_early) {
+        stores.remove();
     }
+    answer
+}
+
+/// Whether an error ends a run that the same command continues.
+fn ends_early(error: &anyhow::Error) -> bool {
+    error.is::<Interrupted>() || concerns_the_disk(error)
+}
+
+/// Runs over the data sets that are named.
+fn run_datasets(args: &BenchArgs, stores: &mut OwnStores) -> Result<Answer> {
     refuse_same_names(&args.datasets)?;
     for root in &args.datasets {
         refuse_images_of(root, &args.output)?;
@@ -35,7 +56,8 @@ pub fn run(args: &BenchArgs) -> Result<Answer> {
             1 => args.output.clone(),
             _ => args.output.join(root.file_name().unwrap_or_default()),
         };
-        let figures = with_cache(&args.run, &output, |run| repeat(args, run, &root, args.gps, &output))?;
+        let run = with_store(&args.run, &output, stores)?;
+        let figures = repeat(args, &run, &root, args.gps, &output)?;
         for of_seed in &figures {
             warn_skipped(&of_seed.skipped);
             print::data(markdown_tables(of_seed).trim_end())?;
@@ -78,7 +100,7 @@ fn refuse_same_names(datasets: &[PathBuf]) -> Result<()> {
 }
 
 /// Runs over all that is registered and compares with the baseline.
-fn run_registry(args: &BenchArgs) -> Result<Answer> {
+fn run_registry(args: &BenchArgs, stores: &mut OwnStores) -> Result<Answer> {
     let file = &args.registry.registry;
     let mut registry = Registry::read(file)?;
     registry.keep_only(&args.registry.only)?;
@@ -99,12 +121,11 @@ fn run_registry(args: &BenchArgs) -> Result<Answer> {
         };
         // One store for all parameter sets and seeds: what does not depend on them is done once.
         let output = args.output.join(&entry.name);
-        let runs = with_cache(&args.run, &output, |run| {
-            registry.parameters.iter().map(|set| run_entry(args, run, entry, set, &root)).collect()
-        });
+        let run = with_store(&args.run, &output, stores)?;
+        let runs = registry.parameters.iter().map(|set| run_entry(args, &run, entry, set, &root)).collect();
         match runs {
             Ok(runs) => harness.runs.extend::<Vec<HarnessRun>>(runs),
-            Err(error) if error.is::<Interrupted>() || concerns_the_disk(&error) => return Err(error),
+            Err(error) if ends_early(&error) => return Err(error),
             Err(error) => {
                 print::note(&format!("{} failed:", entry.name));
                 super::show(&error);
@@ -181,12 +202,13 @@ fn repeat(
     seeds(args).map(one).collect()
 }
 
-/// Calls `work` with the given store, else with a new one, so that the times are those of the whole work.
-fn with_cache<R>(run: &RunArgs, output: &Path, work: impl FnOnce(&RunArgs) -> Result<R>) -> Result<R> {
+/// The options with the given store, else with one of its own, so that the times are those of the whole work.
+fn with_store(run: &RunArgs, output: &Path, stores: &mut OwnStores) -> Result<RunArgs> {
+    if run.cache.is_some() {
+        return Ok(run.clone());
+    }
     create_folder(output)?;
-    let fresh = tempfile::Builder::new().prefix(".bench-cache-").tempdir_in(output)?;
-    let cache = run.cache.clone().unwrap_or_else(|| fresh.path().to_owned());
-    work(&RunArgs { cache: Some(cache), ..run.clone() })
+    Ok(RunArgs { cache: Some(stores.add(output)?), ..run.clone() })
 }
 
 /// `results.json`, tables, plots, errors, poses and pictures.

@@ -149,3 +149,22 @@ fn kill_9_at_any_moment_loses_no_finished_job_and_changes_no_byte() {
         "{trial} builds, {killed} kills hit a running build, {kept} jobs finished before them; whole: {whole_ms} ms"
     );
 }
+
+#[test]
+fn a_benchmark_goes_on_with_what_a_killed_one_has_left() {
+    let folder = tempfile::tempdir().unwrap();
+    town(folder.path());
+    let bench = |more: &[&str]| {
+        let output = setloc(folder.path(), &[&["bench", "town", "-o", "out"], more].concat());
+        assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+        said(&output)
+    };
+    bench(&["--cache", "out/.bench-cache-left"]);
+    let text = bench(&[]);
+    assert!(
+        text.contains("note: results of a run that came to no end are used (out/.bench-cache-left)"),
+        "{text}"
+    );
+    assert_eq!(logged(&folder.path().join("out/run.jsonl"), "finished"), [""; 0]);
+    assert!(!folder.path().join("out/.bench-cache-left").exists());
+}
