@@ -114,6 +114,8 @@ struct Slot {
     file: Option<Arc<Vec<u8>>>,
     /// Users that have not finished; the value is dropped from memory after the last.
     users_left: usize,
+    /// Whether the value is nowhere but in memory.
+    is_unstored: bool,
     dependencies_left: usize,
 }
 
@@ -182,6 +184,7 @@ impl<'a> Executor<'a> {
                 value: None,
                 file: None,
                 users_left: graph.user_count(id),
+                is_unstored: false,
                 dependencies_left: graph.uses(id).count(),
             })
             .collect();
@@ -306,7 +309,7 @@ impl<'a> Executor<'a> {
         for used in self.graph.uses(id).map(|(used, _)| used) {
             let slot = &mut shared.slots[used.index()];
             slot.users_left -= 1;
-            if slot.users_left == 0 {
+            if slot.users_left == 0 && !slot.is_unstored {
                 slot.value = None;
             }
         }
@@ -472,7 +475,8 @@ impl<'a> Executor<'a> {
         let Product { value, file, is_kept } = product?;
         let (output, file) = (ContentHash::of(&file), Arc::new(file));
         let slot = &mut self.lock().slots[id.index()];
-        if slot.users_left > 0 {
+        slot.is_unstored = !is_kept;
+        if slot.users_left > 0 || slot.is_unstored {
             slot.value = Some(value);
         }
         if self.graph.wants_file(id) {
@@ -557,7 +561,9 @@ impl<'a> Executor<'a> {
         self.options.observer.notice(&Event::Warning { text });
         self.options.store.discard(output);
         let product: Product = (self.graph.job(id).work)(&Inputs::new(self, id))?;
-        if let Err(error) = self.options.store.write(&self.fingerprint(id), &product.file, 0.0) {
+        if product.is_kept
+            && let Err(error) = self.options.store.write(&self.fingerprint(id), &product.file, 0.0)
+        {
             let text = format!("{label} was made again but cannot be kept: {error:#}");
             self.options.observer.notice(&Event::Warning { text });
         }
@@ -684,6 +690,36 @@ mod tests {
         let open = run_where(3);
         assert_eq!((open.ran, open.hits), (vec!["test held".to_owned(), "test user".to_owned()], 1));
         assert_eq!(run_where(4).hits, 3);
+    }
+
+    #[test]
+    fn what_is_for_one_run_only_is_made_once_and_never_stored() {
+        let (_folder, store) = store();
+        let made = AtomicUsize::new(0);
+        let work = || {
+            made.fetch_add(1, Ordering::SeqCst);
+            Ok(Product::new(Number(5))?.for_this_run_only())
+        };
+        let mut graph = JobGraph::default();
+        // Nobody has said that it will be loaded.
+        let id = graph.add(job("degraded", 1, &work));
+        let (observer, stop) = (Broadcast::default(), AtomicBool::new(false));
+        let options = RunOptions {
+            store: &store,
+            observer: &observer,
+            threads: 1,
+            memory: 100,
+            stop: &stop,
+            noted_as: None,
+        };
+        let executor = Executor::new(&graph, &options);
+        executor.run().unwrap();
+        assert_eq!(executor.load::<Number>(id).unwrap().0, 5);
+        assert_eq!(made.load(Ordering::SeqCst), 1);
+        // Nor where it is made in place of a file that is damaged.
+        let again = executor.remake(id, executor.output(id).unwrap(), &anyhow::anyhow!("damaged")).unwrap();
+        assert_eq!(again.downcast::<Number>().unwrap().0, 5);
+        assert!(store.lookup(executor.fingerprint(id).key()).is_none());
     }
 
     #[test]

@@ -134,9 +134,10 @@ fn read_mask(path: &Path, hash: ContentHash) -> Result<stages::Mask> {
         .with_context(|| format!("mask {}", path.display()))
 }
 
-/// The bytes that were hashed when the run was planned.
+/// The bytes that were hashed when the run was planned, or when the scene was built that an image is of.
 pub(super) fn read_unchanged(path: &Path, hash: ContentHash) -> Result<Vec<u8>> {
     let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    anyhow::ensure!(ContentHash::of(&bytes) == hash, "{} changed while it was used", path.display());
+    let is_same = ContentHash::of(&bytes) == hash;
+    anyhow::ensure!(is_same, "{} has changed since it was first read", path.display());
     Ok(bytes)
 }
