@@ -2,7 +2,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 use rayon::prelude::*;
 use serde_json::Value;
 use setloc_features::{Calibration, Camera, ImageFeatures};
@@ -16,6 +16,7 @@ use crate::building::{
     has_guessed_cameras, left_apart, tell_cameras,
 };
 use crate::codec;
+use crate::colmap::{ColmapFormat, PARTS};
 use crate::config::Config;
 use crate::dataset::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, unread_images};
 use crate::error::Hinted;
@@ -68,7 +69,7 @@ pub fn build(args: &BuildArgs) -> Result<BuiltScene> {
     let session = args.source.run.session(output, Some(&export))?;
     let name = session.store.name_of("build", output);
     // The report is written last: exports of another scene, as a killed run leaves them, are none of this one.
-    let present = before.as_ref().map(|file| file.hash).filter(|hash| reported_scene(&export) == Some(*hash));
+    let present = before.as_ref().map(|file| file.hash).filter(|hash| has_exports(&export, *hash));
     let stays =
         |scene: &SceneFile| scene.main().is_none() && before.as_ref().is_some_and(|file| file.is_of_use);
     let write = |built: &Built| {
@@ -330,6 +331,36 @@ pub fn reported_scene(folder: &Path) -> Option<ContentHash> {
     serde_json::from_value(report["scene"].clone()).ok()
 }
 
+/// Whether all that was exported of a scene is in a folder as it was written.
+fn has_exports(folder: &Path, scene: ContentHash) -> bool {
+    let exports = || -> Option<BTreeMap<String, ContentHash>> {
+        let report: Value = serde_json::from_slice(&std::fs::read(folder.join(REPORT)).ok()?).ok()?;
+        serde_json::from_value(report[EXPORTS].clone()).ok()
+    };
+    let is_whole = |(name, hash): (&String, &ContentHash)| {
+        std::fs::read(folder.join(name)).is_ok_and(|file| ContentHash::of(&file) == *hash)
+    };
+    reported_scene(folder) == Some(scene) && exports().is_some_and(|exports| exports.par_iter().all(is_whole))
+}
+
+/// What [`write_models`] has written of so many components, by the path in the folder.
+fn exports_of(folder: &Path, components: usize) -> Result<BTreeMap<String, ContentHash>> {
+    let mut files = vec![PathBuf::from(POSES)];
+    for at in 0..components.max(1) {
+        let of_component = component_folder(Path::new(""), at);
+        files.extend([POINT_CLOUD, PICTURE].map(|name| of_component.join(name)));
+        let of_colmap =
+            PARTS.map(|part| of_component.join(COLMAP_MODEL).join(ColmapFormat::Binary.file(part)));
+        files.extend(of_colmap.into_iter().filter(|file| folder.join(file).is_file()));
+    }
+    let hash = |file: PathBuf| {
+        let path = folder.join(&file);
+        let content = std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        Ok((file.to_string_lossy().into_owned(), ContentHash::of(&content)))
+    };
+    files.into_par_iter().with_max_len(1).map(hash).collect()
+}
+
 fn list_sources(source: &SourceArgs) -> Result<Vec<(String, PathBuf)>> {
     if source.panoramas.is_empty() {
         return Err(Hinted::error(
@@ -415,7 +446,7 @@ pub fn write_models(
     let grown = scene.grown_names();
     let write = |(at, component)| write_model(&component_folder(folder, at), component, features, &grown);
     let (poses, models) = rayon::join(
-        || write_json(&folder.join("poses.json"), &scene_json(scene)),
+        || write_json(&folder.join(POSES), &scene_json(scene)),
         || components.par_iter().with_max_len(1).enumerate().try_for_each(write),
     );
     poses.and(models)?;
@@ -430,6 +461,9 @@ fn component_folder(folder: &Path, at: usize) -> PathBuf {
 }
 
 const REPORT: &str = "report.json";
+/// Of the report: hashes of the files beside it.
+const EXPORTS: &str = "exports";
+const POSES: &str = "poses.json";
 const POINT_CLOUD: &str = "points.ply";
 const COLMAP_MODEL: &str = "colmap";
 
@@ -459,8 +493,8 @@ fn remove_model(folder: &Path) -> Result<()> {
     remove_files(folder, &[POINT_CLOUD, PICTURE])
 }
 
-/// What the run cost, and what is to be said of the scene and of the images that it was given, with the cameras that it told; written
-/// last.
+/// What the run cost, what was exported, and what is to be said of the scene and of the images that it was given, with the cameras that
+/// it told; written last.
 pub fn write_report(
     folder: &Path,
     (scene, hash): (&SceneFile, ContentHash),
@@ -470,6 +504,7 @@ pub fn write_report(
 ) -> Result<()> {
     let mut report = session.report.to_json();
     report["scene"] = serde_json::json!(hash);
+    report[EXPORTS] = serde_json::json!(exports_of(folder, scene.components.len())?);
     note_remarks(&mut report, scene, skipped, images);
     write_json(&folder.join(REPORT), &report)
 }

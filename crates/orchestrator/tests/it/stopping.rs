@@ -168,3 +168,27 @@ fn a_benchmark_goes_on_with_what_a_killed_one_has_left() {
     assert_eq!(logged(&folder.path().join("out/run.jsonl"), "finished"), [""; 0]);
     assert!(!folder.path().join("out/.bench-cache-left").exists());
 }
+
+#[test]
+fn exports_that_are_lost_or_damaged_are_written_again() {
+    let folder = tempfile::tempdir().unwrap();
+    town(folder.path());
+    let build = || {
+        let output = setloc(folder.path(), &["build", "town/panoramas", "-o", "s.setloc"]);
+        assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+        said(&output)
+    };
+    build();
+    let whole = outputs(folder.path());
+    assert!(build().contains("s.setloc is up to date: nothing changed"));
+    for name in ["points.ply", "top_view.png", "colmap/images.bin"] {
+        std::fs::remove_file(folder.path().join("s").join(name)).unwrap();
+        assert!(build().contains("wrote s.setloc and s/"), "{name}");
+    }
+    // Of the same length.
+    let poses = folder.path().join("s/poses.json");
+    let damaged = std::fs::read_to_string(&poses).unwrap().replacen('0', "1", 1);
+    std::fs::write(&poses, damaged).unwrap();
+    assert!(build().contains("wrote s.setloc and s/"));
+    assert!(outputs(folder.path()) == whole);
+}
