@@ -9,7 +9,7 @@ mod ply;
 mod poses;
 mod top_view;
 
-pub use colmap::{colmap_lacks, remove_colmap, renew_colmap, write_colmap};
+pub use colmap::{colmap_lacks, error_px, remove_colmap, renew_colmap, write_colmap};
 pub use geojson::geojson;
 pub use kml::kml;
 pub use nerfstudio::nerfstudio;

@@ -6,6 +6,7 @@ use setloc_features::ImageFeatures;
 use setloc_sfm::{Observation, Reconstruction, ReconstructionPoint, Rigid, Similarity, nearest_rotation};
 
 use super::NormalizedError;
+use crate::export::error_px;
 
 /// One image's error against truth.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -319,10 +320,8 @@ pub fn mean_angular_error_px(
 ) -> Option<f64> {
     let of_image: Vec<_> = model.images.iter().map(|image| features.get(&image.name)).collect();
     let error = |observation: &Observation, position: &Vector3<f64>| {
-        let pose = model.images[observation.image.index()].world_from_camera?;
         let keypoint = of_image[observation.image.index()]?.keypoints.get(observation.feature as usize)?;
-        let (bearing, unit) = model.camera_of(observation.image).ray(&keypoint.pixel())?;
-        Some(pose.inverse_transform_point(position).angle(&bearing) / unit)
+        error_px(model, observation.image, keypoint, position)
     };
     let of_point = |point: &ReconstructionPoint| -> Vec<f64> {
         point.track.iter().filter_map(|observation| error(observation, &point.position)).collect()

@@ -2,9 +2,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use anyhow::Result;
+use nalgebra::Vector3;
 use rayon::prelude::*;
 use setloc_features::{ImageFeatures, Keypoint};
-use setloc_sfm::{CameraId, Observation, Reconstruction, ReconstructionImage, ReconstructionPoint};
+use setloc_sfm::{CameraId, ImageId, Observation, Reconstruction, ReconstructionImage, ReconstructionPoint};
 
 use crate::colmap::{BYTES_OF_POINT_2D, ColmapFormat, FURTHER_PARTS, NO_POINT, PARTS};
 use crate::error::Hinted;
@@ -14,6 +15,8 @@ use crate::store::{remove_files, write_pieces_atomically};
 const POINTS_OF_PIECE: usize = 2048;
 /// About what the record of a point takes; more is made room for.
 const BYTES_OF_POINT: usize = 96;
+/// COLMAP's error of a point of which none is known.
+const NO_ERROR: f64 = -1.0;
 /// COLMAP's number of no camera model.
 const NO_MODEL: i32 = -1;
 
@@ -43,7 +46,8 @@ fn written_as(model: &Reconstruction, used: &BTreeSet<CameraId>) -> BTreeMap<Cam
 /// model is left in the folder, since programs read what they find first.
 ///
 /// Ids count from 1. COLMAP wants camera-from-world poses. `features[i]` belongs to image `i`; without it the image has no
-/// 2D points, and tracks have no element in that image.
+/// 2D points, and tracks have no element in that image. A point's error is the mean one of its 2D points in pixels ([`error_px`]); COLMAP's
+/// value of an unknown one, -1, where it has none.
 ///
 /// COLMAP has no stretched panoramas: they are written as plain ones, and their keypoints where such a one shows them. Those of one
 /// size then have one camera.
@@ -80,7 +84,14 @@ pub fn write_colmap(
     let points = |(piece, points): (usize, &[ReconstructionPoint])| {
         let mut records = Vec::with_capacity(points.len() * BYTES_OF_POINT);
         for (at, point) in points.iter().enumerate() {
-            add_point(&mut records, (piece * POINTS_OF_PIECE + at + 1) as u64, point, &seen);
+            let id = (piece * POINTS_OF_PIECE + at + 1) as u64;
+            let track: Vec<&Observation> =
+                point.track.iter().filter(|sees| sees_point(**sees, id, &seen)).collect();
+            let error = |sees: &&Observation| {
+                let keypoint = keypoints[sees.image.index()].get(sees.feature as usize)?;
+                error_px(model, sees.image, keypoint, &point.position)
+            };
+            add_point(&mut records, id, point, &track, mean(track.iter().filter_map(error)));
         }
         records
     };
@@ -133,18 +144,44 @@ fn camera_records(model: &Reconstruction, cameras: BTreeSet<CameraId>) -> Vec<u8
     records
 }
 
-/// A point's record of `points3D.bin`; `seen` has the point that each keypoint of each image sees.
-fn add_point(records: &mut Vec<u8>, id: u64, point: &ReconstructionPoint, seen: &[Vec<u64>]) {
-    let (p, sees) = (point.position, |observation: &&Observation| {
-        seen[observation.image.index()].get(observation.feature as usize) == Some(&id)
-    });
+/// Whether the keypoint of an observation is written, and sees this point.
+fn sees_point(observation: Observation, id: u64, seen: &[Vec<u64>]) -> bool {
+    seen[observation.image.index()].get(observation.feature as usize) == Some(&id)
+}
+
+/// How far a point is from where a keypoint shows it, in pixels: the angle between them, by that which a pixel spans there; the same
+/// at the seam and at the poles of panoramas. `None` where the image has no pose or the pixel no ray.
+pub fn error_px(
+    model: &Reconstruction,
+    image: ImageId,
+    keypoint: &Keypoint,
+    position: &Vector3<f64>,
+) -> Option<f64> {
+    let pose = model.images[image.index()].world_from_camera?;
+    let (bearing, unit) = model.camera_of(image).ray(&keypoint.pixel())?;
+    Some(pose.inverse_transform_point(position).angle(&bearing) / unit)
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let (count, sum) = values.fold((0_usize, 0.0), |(count, sum), value| (count + 1, sum + value));
+    (count > 0).then(|| sum / count as f64)
+}
+
+/// A point's record of `points3D.bin`, with the observations that are written and their mean error in pixels.
+fn add_point(
+    records: &mut Vec<u8>,
+    id: u64,
+    point: &ReconstructionPoint,
+    track: &[&Observation],
+    error_px: Option<f64>,
+) {
+    let p = point.position;
     records.extend(id.to_le_bytes());
     add_numbers(records, [p.x, p.y, p.z]);
     records.extend(point.color);
-    add_numbers(records, [point.error_sigma]);
-    let track = || point.track.iter().filter(sees);
-    records.extend((track().count() as u64).to_le_bytes());
-    for observation in track() {
+    add_numbers(records, [error_px.unwrap_or(NO_ERROR)]);
+    records.extend((track.len() as u64).to_le_bytes());
+    for observation in track {
         records.extend((observation.image.0 + 1).to_le_bytes());
         records.extend(observation.feature.to_le_bytes());
     }
@@ -187,9 +224,8 @@ pub fn remove_colmap(folder: &Path) -> Result<()> {
 mod tests {
     use std::collections::BTreeMap;
 
-    use nalgebra::Vector3;
     use setloc_features::{Camera, CameraModel};
-    use setloc_sfm::{ImageId, Observation, Rigid};
+    use setloc_sfm::Rigid;
 
     use super::*;
     use crate::colmap::Bytes;
@@ -288,6 +324,37 @@ mod tests {
         assert_eq!(tracks, BTreeMap::from(expected));
         let (points, tracks) = written(&model, &[]);
         assert!(points.is_empty() && tracks.len() == 3 && tracks.values().all(Vec::is_empty), "{tracks:?}");
+    }
+
+    #[test]
+    fn errors_of_points_are_in_pixels() {
+        let camera = Camera::equirectangular(200, 100);
+        // On the horizon, where pixels are square.
+        let position = Vector3::new(1.0, 0.0, 3.0);
+        let shown = camera.project(&position).unwrap();
+        let keypoint = |off: f64| Keypoint {
+            x: shown.x as f32,
+            y: (shown.y + off) as f32,
+            size: 3.0,
+            orientation: 0.0,
+            noise_px: 0.5,
+        };
+        let features =
+            ImageFeatures { keypoints: vec![keypoint(0.5), keypoint(1.5)], ..ImageFeatures::default() };
+        // The second one is in an image without keypoints.
+        let mut model = scene(camera, &[&[(0, 0), (1, 1)], &[(2, 0)]]);
+        model.points[0].position = position;
+        let folder = tempfile::tempdir().unwrap();
+        write_colmap(folder.path(), &model, &[Some(&features), Some(&features), None]).unwrap();
+        let error = |bytes: &mut Bytes<'_>| {
+            bytes.skip(8 + 3 * 8 + 3)?;
+            let error = bytes.f64()?;
+            let count = bytes.u64()?;
+            bytes.skip(8 * count)?;
+            Ok(error)
+        };
+        let errors = read_part(folder.path(), "points3D", error);
+        assert!((errors[0] - 1.0).abs() < 1e-3 && errors[1] == -1.0, "{errors:?}");
     }
 
     #[test]
