@@ -119,7 +119,7 @@ pub struct ImageFolder {
 /// Image files of folders (not their subfolders) and single files: unique names and paths, sorted by name.
 ///
 /// # Errors
-/// When a path does not exist, or no image is there.
+/// When a path does not exist or is a device, or no image is there.
 pub fn list_images(paths: &[PathBuf]) -> Result<Vec<(String, PathBuf)>> {
     let mut files = Vec::new();
     for path in paths {
@@ -133,8 +133,14 @@ pub fn list_images(paths: &[PathBuf]) -> Result<Vec<(String, PathBuf)>> {
                     files.push(entry);
                 }
             }
-        } else {
+        } else if metadata.is_file() {
             files.push(path.clone());
+        } else {
+            // A device or a pipe may have no end.
+            return Err(Hinted::error(
+                format!("{} is neither a file nor a folder", path.display()),
+                "name image files, or folders with images",
+            ));
         }
     }
     // One file is one image, however its folder is written.
@@ -418,6 +424,12 @@ mod tests {
         assert_eq!(camera_of(&info(3), &upright), Some(upright));
         assert_eq!(camera_of(&info(1), &stored), None);
         assert_eq!(camera_of(&info(6), &camera(800, 600, 400.0, 300.0)), None);
+    }
+
+    #[test]
+    fn what_is_neither_file_nor_folder_is_refused() {
+        let error = list_images(&[PathBuf::from("/dev/zero")]).unwrap_err();
+        assert_eq!(error.to_string(), "/dev/zero is neither a file nor a folder");
     }
 
     #[test]

@@ -250,3 +250,21 @@ fn a_scene_is_reported_by_no_results_of_another() {
     assert!(text.contains("error: s has no results of the scene s.setloc\nhint: "), "{text}");
     assert_eq!(run(&["report", "other"]).status.code(), Some(0));
 }
+
+#[test]
+fn an_image_without_end_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let pipe = folder.path().join("a.jpg");
+    let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+    if !made.is_ok_and(|status| status.success()) {
+        eprintln!("skipped: this system makes no pipes by name");
+        return;
+    }
+    let output = setloc(folder.path(), &["build", "a.jpg", "-o", "s.setloc"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(
+        said(&output).contains("error: a.jpg is neither a file nor a folder\nhint: "),
+        "{}",
+        said(&output)
+    );
+}
