@@ -10,6 +10,7 @@ mod unread;
 pub use cameras::CameraBook;
 pub use geo::{GeoBook, GeoSource};
 pub use images::{CameraOrigin, ImageFolder, SkippedImage, SourceImage, list_images, with_told_cameras};
+pub use remarks::truth_without_image;
 pub use truth::{Truth, rigid_of};
 pub use unread::unread_images;
 

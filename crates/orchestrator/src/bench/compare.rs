@@ -44,7 +44,7 @@ pub struct Comparison {
     pub rotation_deg: Option<Bounds>,
     /// Share of all judged images within an error of centre and rotation, in percent, by these errors.
     pub recall: BTreeMap<String, f64>,
-    /// AUC of relative poses in percent, by threshold in degrees.
+    /// AUC of relative poses in percent, by threshold in degrees; empty where a single image is judged.
     pub auc: BTreeMap<String, f64>,
     /// By true name.
     pub errors: Errors,
@@ -87,7 +87,7 @@ impl Comparison {
                 errors.values().filter(|e| e.position_m <= position && e.rotation_deg <= rotation);
             (recall_name(position, rotation), 100.0 * is_within.count() as f64 / judged.len().max(1) as f64)
         };
-        let areas = auc_percent(&poses, &judged);
+        let areas = auc_percent(&poses, &judged).into_iter().flatten();
         Self {
             name: name.to_owned(),
             images: judged.len(),
@@ -178,7 +178,10 @@ pub fn comparison_table(comparisons: &[Comparison]) -> String {
             RECALLS.iter().map(|(position, rotation)| of_one.recall.get(&recall_name(*position, *rotation)));
         let areas = AUC_THRESHOLDS_DEG.iter().map(|threshold| of_one.auc.get(&threshold.to_string()));
         for percent in recalls.chain(areas) {
-            add(&mut text, format_args!(" {:.1} |", percent.copied().unwrap_or(0.0)));
+            match percent {
+                Some(percent) => add(&mut text, format_args!(" {percent:.1} |")),
+                None => text += " - |",
+            }
         }
         text.push('\n');
     }
@@ -255,13 +258,20 @@ mod tests {
         assert_eq!(known(&["0.jpg", "13.jpg", "3.jpg", "panoramas/3.jpg"]), (vec![], 4));
     }
 
+    fn one_of(poses: &BTreeMap<String, Rigid>) -> BTreeMap<String, Rigid> {
+        poses.iter().take(1).map(|(name, pose)| (name.clone(), *pose)).collect()
+    }
+
     #[test]
     fn what_cannot_be_aligned_has_no_errors() {
         let truth = truth();
-        let one = truth.iter().take(1).map(|(name, pose)| (name.clone(), *pose)).collect();
-        let found = Comparison::of("a", &one, &truth, &Frame::Aligned);
+        let found = Comparison::of("a", &one_of(&truth), &truth, &Frame::Aligned);
         assert_eq!((found.registered, found.position, found.scale), (1, None, None));
         let table = comparison_table(&[found]);
         assert!(table.contains("| a | 1/6 | 0 | - | - | 0.0 |"), "{table}");
+        // A single image that is judged has no relative pose.
+        let judged = Comparison::of("a", &truth, &one_of(&truth), &Frame::Same);
+        let table = comparison_table(&[judged]);
+        assert!(table.ends_with("| 100.0 | 100.0 | 100.0 | - | - | - | - | - |\n"), "{table}");
     }
 }

@@ -1,4 +1,4 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -14,7 +14,9 @@ use super::{
 };
 use crate::building::{BuildOutcome, Built, SceneSource, build_scene};
 use crate::config::Config;
-use crate::dataset::{CameraBook, GeoSource, ImageFolder, SkippedImage, Truth, list_images};
+use crate::dataset::{
+    CameraBook, GeoSource, ImageFolder, SkippedImage, Truth, list_images, truth_without_image,
+};
 use crate::error::{Hinted, Interrupted, concerns_the_disk};
 use crate::jobs::LocateJobs;
 use crate::locating::{Located, Mode, locate};
@@ -130,13 +132,15 @@ pub struct DatasetFigures {
     pub scene_errors: Errors,
 }
 
+const TRUTH: &str = "truth.json";
+
 /// Builds the scene of a data set, locates its sets and compares with its truth.
 ///
 /// # Errors
 /// When the folder is no data set, the run was stopped or the store cannot be written.
 pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> Result<DatasetFigures> {
     let optional = |name: &str| Some(root.join(name)).filter(|path| path.is_file());
-    let truth = optional("truth.json").map(|path| Truth::read(&path)).transpose()?;
+    let truth = optional(TRUTH).map(|path| Truth::read(&path)).transpose()?;
     let cameras =
         optional("cameras.json").map(|path| CameraBook::read(&path)).transpose()?.unwrap_or_default();
     let kind =
@@ -186,10 +190,12 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
     let mut skipped_sets = BTreeMap::new();
     let mut warnings = folder.warnings.clone();
     warnings.extend(built.scene.warnings.clone());
+    let mut names: BTreeSet<String> = files.iter().map(|(name, _)| name.clone()).collect();
     for set in set_folders(root)? {
         let name = set.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         // A set of nothing readable leaves the others as they are.
         let read = list_below(root, &set).and_then(|files| {
+            names.extend(files.iter().map(|(name, _)| name.clone()));
             // One file is for all folders; it need not know this one's cameras.
             let knows_any = files.iter().any(|(name, path)| cameras.find(name, path).is_some());
             let known = if knows_any { &cameras } else { &CameraBook::default() };
@@ -221,6 +227,9 @@ pub fn bench_dataset(session: &Session, root: &Path, options: &BenchOptions) -> 
         warnings.extend(photos.warnings);
         found.push(LocatedSet { name, images: files.len(), target, located, photos: as_read });
     }
+    let names = names.iter().map(String::as_str).collect();
+    let of_none = |truth: &Truth| truth_without_image(&root.join(TRUTH), truth, &names);
+    warnings.extend(truth.as_ref().and_then(of_none));
     let (wall_s, cpu_s) = session.report.totals();
     let (stages, peak_rss_mb) = (session.report.stages(), crate::clock::peak_rss_mib());
     let is_told = !truth_of("queries/").is_empty();
@@ -329,7 +338,7 @@ fn scene_figures(
         let deviations = model.registered().filter_map(|id| errors.deviation(model, id));
         Bounds::of(deviations.map(value)).map(Into::into)
     };
-    let auc = || AUC_THRESHOLDS_DEG.iter().map(f64::to_string).zip(auc_percent(estimated, truth)).collect();
+    let auc = |areas: [f64; 5]| AUC_THRESHOLDS_DEG.iter().map(f64::to_string).zip(areas).collect();
     SceneFigures {
         images,
         registered: estimated.len(),
@@ -343,7 +352,7 @@ fn scene_figures(
         rotation_own_deg: Bounds::of(own_rotation_errors_deg(estimated, truth)).map(Into::into),
         position_sigma_m: alignment.and_then(|alignment| stated(&|sigma| sigma.center * alignment.scale())),
         rotation_sigma_deg: stated(&|sigma| sigma.rotation_rad.to_degrees()),
-        auc: (!truth.is_empty()).then(auc),
+        auc: auc_percent(estimated, truth).map(auc),
     }
 }
 

@@ -1,9 +1,9 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use setloc_features::{Camera, CameraModel, CameraSource};
 
-use super::{CameraBook, CameraOrigin, GeoBook, GeoSource, ImageFolder, SourceImage, shared};
+use super::{CameraBook, CameraOrigin, GeoBook, GeoSource, ImageFolder, SourceImage, Truth, shared};
 use crate::fingerprint::ContentHash;
 use crate::stages;
 use crate::text::some_of;
@@ -119,7 +119,7 @@ fn cameras_without_image(images: &[SourceImage], cameras: &CameraBook) -> Option
         return None;
     }
     let found = images.iter().any(|image| cameras.find(&image.name, &image.path).is_some());
-    (!found).then(|| fits_none(file, "the camera", cameras.first_name(), images))
+    (!found).then(|| fits_none(file, "the camera", cameras.first_name(), first_name(images)))
 }
 
 fn positions_without_image(images: &[SourceImage], geo: &GeoSource, table: &GeoBook) -> Option<String> {
@@ -129,15 +129,31 @@ fn positions_without_image(images: &[SourceImage], geo: &GeoSource, table: &GeoB
     match geo {
         GeoSource::None => None,
         GeoSource::Exif => Some("no image has a position in its EXIF".to_owned()),
-        GeoSource::Table(file) => Some(fits_none(file, "the position", table.first_name(), images)),
+        GeoSource::Table(file) => {
+            Some(fits_none(file, "the position", table.first_name(), first_name(images)))
+        }
     }
 }
 
+/// What a truth tells of no image, of those that are called so: all of it, or some poses.
+pub fn truth_without_image(file: &Path, truth: &Truth, images: &BTreeSet<&str>) -> Option<String> {
+    let lost: Vec<String> = truth.names().filter(|name| !images.contains(name)).map(str::to_owned).collect();
+    if lost.len() == truth.names().count() {
+        return Some(fits_none(file, "the pose", truth.names().next(), images.first().copied()));
+    }
+    let message = format!("{} has poses of no image", file.display());
+    (!lost.is_empty()).then(|| format!("{message}: {}", some_of(&lost, "poses")))
+}
+
 /// One listed name and one image's, so that the difference shows.
-fn fits_none(file: &Path, what: &str, listed: Option<&str>, images: &[SourceImage]) -> String {
+fn fits_none(file: &Path, what: &str, listed: Option<&str>, image: Option<&str>) -> String {
     let listed = listed.map_or_else(|| "it lists none".to_owned(), |name| format!("it lists `{name}`"));
-    let called = images.first().map_or("", |image| &image.name);
+    let called = image.unwrap_or_default();
     format!("{} has {what} of no image: {listed}, an image is called `{called}`", file.display())
+}
+
+fn first_name(images: &[SourceImage]) -> Option<&str> {
+    images.first().map(|image| image.name.as_str())
 }
 
 fn contradicted_cameras(images: &[SourceImage], cameras: &CameraBook) -> Option<String> {
@@ -484,6 +500,24 @@ mod tests {
             "masks of another aspect ratio are stretched to their images: p/b.png is 64×32, its mask 32×32";
         assert_eq!(of_masks, [stretched]);
         assert_eq!(folder.read_alone().mask_summary(), None);
+    }
+
+    #[test]
+    fn a_truth_of_no_image_is_said_and_so_are_single_poses() {
+        let folder = Folder::of(&[]);
+        let pose = r#"{"q_wxyz": [1, 0, 0, 0], "center": [0, 0, 0]}"#;
+        let said = |images: &str| {
+            let file =
+                folder.write("truth.json", &format!(r#"{{"images": {{{}}}}}"#, images.replace('@', pose)));
+            let names = BTreeSet::from(["p/a.png", "p/b.png"]);
+            truth_without_image(Path::new("truth.json"), &Truth::read(&file).unwrap(), &names)
+        };
+        assert_eq!(said(r#""p/a.png": @"#), None);
+        let some = "truth.json has poses of no image: q/c.png";
+        assert_eq!(said(r#""p/a.png": @, "q/c.png": @"#).unwrap(), some);
+        let none = "truth.json has the pose of no image: it lists `a.png`, an image is called `p/a.png`";
+        assert_eq!(said(r#""a.png": @"#).unwrap(), none);
+        assert!(said("").unwrap().contains("it lists none"));
     }
 
     #[test]

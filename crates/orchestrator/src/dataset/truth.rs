@@ -54,6 +54,11 @@ impl Truth {
         serde_json::from_str(&text).with_context(|| format!("{} is no truth.json", path.display()))
     }
 
+    /// The images that it has a pose of, by name.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.images.keys().map(String::as_str)
+    }
+
     /// The true `world_from_camera` of the images whose name starts with `prefix`.
     pub fn poses(&self, prefix: &str) -> BTreeMap<String, Rigid> {
         let named = self.images.iter().filter(|(name, _)| name.starts_with(prefix));

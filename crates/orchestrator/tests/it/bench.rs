@@ -126,11 +126,17 @@ fn a_set_without_a_readable_photo_is_skipped_and_said() {
         std::fs::create_dir(queries.join(set)).unwrap();
     }
     std::fs::write(queries.join("text/a.jpg"), "this is no picture").unwrap();
+    let truth = folder.path().join("town/truth.json");
+    let named =
+        std::fs::read_to_string(&truth).unwrap().replace("panoramas/", "panos/").replace("queries/", "q/");
+    std::fs::write(&truth, named).unwrap();
     std::fs::write(queries.join("truncated/a.jpg"), &photo[..photo.len() / 2]).unwrap();
-    let output = setloc(folder.path(), &["bench", "town", "-o", "out"]);
+    let output = setloc(folder.path(), &["bench", "town", "-o", "out", "--no-joint-reference"]);
     let text = said(&output);
     assert_eq!(output.status.code(), Some(0), "{text}");
     let results = json_of(&folder.path().join("out/results.json"));
+    let warnings = results["warnings"].to_string();
+    assert!(warnings.contains("truth.json has the pose of no image: it lists `panos/"), "{warnings}");
     let names: Vec<&Value> = results["sets"].as_array().unwrap().iter().map(|set| &set["name"]).collect();
     assert_eq!(names, ["lane"]);
     let reasons = [("empty", "no images in "), ("text", "queries/text/a.jpg"), ("truncated", "truncated")];
