@@ -8,6 +8,7 @@ use serde::Deserialize;
 
 use crate::config::Config;
 use crate::error::Hinted;
+use crate::text::read_text;
 
 /// A batch. Paths are relative to the manifest.
 #[derive(Debug, Clone, Deserialize)]
@@ -72,7 +73,7 @@ impl Manifest {
     /// With file, and line or name.
     pub fn read(path: &Path) -> Result<Self> {
         let shown = path.display();
-        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {shown}"))?;
+        let text = read_text(path)?;
         let manifest: Self = toml::from_str(&text).map_err(|error| {
             let error = anyhow::Error::new(error).context(format!("{shown} is no valid manifest"));
             Hinted::wrap(error, "README, \"Many scenes at once\", shows one")

@@ -9,6 +9,7 @@ use super::BenchGps;
 use crate::config::Config;
 use crate::error::Hinted;
 use crate::fingerprint::ContentHash;
+use crate::text::read_text;
 
 /// Which data sets a benchmark runs over, and with which parameters.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -81,8 +82,7 @@ impl Registry {
     /// With file, and line or name.
     pub fn read(path: &Path) -> Result<Self> {
         let shown = path.display();
-        let text = std::fs::read_to_string(path).map_err(|error| {
-            let error = anyhow::Error::new(error).context(format!("cannot read {shown}"));
+        let text = read_text(path).map_err(|error| {
             Hinted::wrap(error, "name data sets (`setloc bench DATASET`) or a registry (--registry FILE)")
         })?;
         let mut registry: Self =

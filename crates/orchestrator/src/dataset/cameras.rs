@@ -1,20 +1,54 @@
 use std::collections::BTreeMap;
+use std::fmt;
+use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use serde::Deserialize;
+use serde::de::{Error as _, MapAccess, Visitor};
+use serde::{Deserialize, Deserializer};
 use setloc_features::Camera;
 
 use super::find_by_name;
 use crate::error::Hinted;
+use crate::text::read_text;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CamerasFile {
     #[serde(default, rename = "convention")]
     _convention: String,
+    #[serde(deserialize_with = "unique")]
     cameras: BTreeMap<String, Camera>,
+    #[serde(deserialize_with = "unique")]
     images: BTreeMap<String, String>,
+}
+
+/// A map in which no key is twice: one of the two would be meant for nothing.
+fn unique<'de, D, T>(deserializer: D) -> Result<BTreeMap<String, T>, D::Error>
+where
+    D: Deserializer<'de>,
+    T: Deserialize<'de>,
+{
+    struct Unique<T>(PhantomData<T>);
+    impl<'de, T: Deserialize<'de>> Visitor<'de> for Unique<T> {
+        type Value = BTreeMap<String, T>;
+
+        fn expecting(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+            formatter.write_str("a map")
+        }
+
+        fn visit_map<A: MapAccess<'de>>(self, mut entries: A) -> Result<Self::Value, A::Error> {
+            let mut map = BTreeMap::new();
+            while let Some(key) = entries.next_key::<String>()? {
+                if map.contains_key(&key) {
+                    return Err(A::Error::custom(format!("`{key}` is there twice")));
+                }
+                map.insert(key, entries.next_value()?);
+            }
+            Ok(map)
+        }
+    }
+    deserializer.deserialize_map(Unique(PhantomData))
 }
 
 /// Known cameras, by image.
@@ -32,7 +66,7 @@ impl CameraBook {
     /// With file, line and key, when it is not one or a camera is not usable or cannot be that of its image.
     pub fn read(path: &Path) -> Result<Self> {
         let shown = path.display();
-        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {shown}"))?;
+        let text = read_text(path)?;
         let file: CamerasFile =
             serde_json::from_str(&text).with_context(|| format!("{shown} is no cameras.json"))?;
         for (name, camera) in &file.cameras {
@@ -99,5 +133,22 @@ mod tests {
             hint,
             "its params are fx, fy, cx, cy, in pixels of an image of 1024 × 768 that begins at (0, 0)"
         );
+    }
+
+    #[test]
+    fn a_name_that_is_there_twice_is_refused_with_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cameras.json");
+        let lens = r#"{"model": "PINHOLE", "width": 1024, "height": 768, "params": [760, 760, 512, 384]}"#;
+        let read = |cameras: &str, images: &str| {
+            let text = format!("\u{feff}{{\n\"cameras\": {{{cameras}}},\n\"images\": {{{images}}}}}");
+            std::fs::write(&path, text.replace('@', lens)).unwrap();
+            CameraBook::read(&path).map_err(|error| format!("{error:#}"))
+        };
+        assert!(read(r#""a": @, "b": @"#, r#""1.jpg": "a", "2.jpg": "b""#).is_ok());
+        let of_cameras = read(r#""a": @, "a": @"#, "").unwrap_err();
+        assert!(of_cameras.contains("`a` is there twice at line 2"), "{of_cameras}");
+        let of_images = read(r#""a": @, "b": @"#, r#""1.jpg": "a", "1.jpg": "b""#).unwrap_err();
+        assert!(of_images.contains("`1.jpg` is there twice at line 3"), "{of_images}");
     }
 }

@@ -1,4 +1,5 @@
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
@@ -6,7 +7,10 @@ use setloc_features::GeoPosition;
 
 use super::{SourceImage, find_by_name, shared};
 use crate::error::Hinted;
-use crate::text::some_of;
+use crate::text::{read_text, some_of};
+
+/// Metres above the ellipsoid at which there is anything to be photographed.
+const ALTITUDES_M: RangeInclusive<f64> = -1000.0..=100_000.0;
 
 /// Where measured positions come from.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -53,6 +57,11 @@ impl Columns {
         Ok(Self { name: needed("name")?, lat: needed("lat")?, lon: needed("lon")?, alt: place("alt") })
     }
 
+    /// How many there are.
+    fn count(self) -> usize {
+        if self.alt.is_some() { 4 } else { 3 }
+    }
+
     /// The image and its position in a line.
     fn read(self, fields: &[&str]) -> Option<(String, GeoPosition)> {
         let field = |at: usize| fields.get(at).copied().unwrap_or_default();
@@ -63,13 +72,40 @@ impl Columns {
         };
         let place = GeoPosition { lat_deg: number(self.lat)?, lon_deg: number(self.lon)?, alt_m };
         let name = field(self.name);
-        (place.is_valid() && !name.is_empty()).then(|| (name.to_owned(), place))
+        let is_plausible = place.is_valid() && alt_m.is_none_or(|alt| ALTITUDES_M.contains(&alt));
+        (is_plausible && !name.is_empty()).then(|| (name.to_owned(), place))
     }
 }
 
-/// A field without the quotes that some programs put about texts.
-fn unquoted(field: &str) -> &str {
-    field.strip_prefix('"').and_then(|field| field.strip_suffix('"')).unwrap_or(field)
+/// The fields of a line, without the blanks about them; in quotes, which are written twice there, they may have commas (RFC 4180).
+/// `None` where a quote has no end, or is followed by anything but a comma.
+fn fields_of(line: &str) -> Option<Vec<String>> {
+    let (mut fields, mut rest) = (Vec::new(), line);
+    loop {
+        rest = rest.trim_start();
+        let mut field = String::new();
+        if let Some(mut quoted) = rest.strip_prefix('"') {
+            loop {
+                let (part, behind) = quoted.split_once('"')?;
+                field += part;
+                let Some(further) = behind.strip_prefix('"') else {
+                    rest = behind.trim_start();
+                    break;
+                };
+                field.push('"');
+                quoted = further;
+            }
+        } else {
+            let end = rest.find(',').unwrap_or(rest.len());
+            rest[..end].trim_end().clone_into(&mut field);
+            rest = &rest[end..];
+        }
+        fields.push(field);
+        match rest.strip_prefix(',') {
+            Some(further) => rest = further,
+            None => return rest.is_empty().then_some(fields),
+        }
+    }
 }
 
 impl GeoBook {
@@ -80,18 +116,17 @@ impl GeoBook {
     /// With file and line.
     pub fn read(path: &Path) -> Result<Self> {
         let shown = path.display();
-        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {shown}"))?;
-        // Spreadsheet programs put a byte order mark before the first name.
-        let text = text.trim_start_matches('\u{feff}');
+        let text = read_text(path)?;
         let mut columns = None;
         let mut by_image: BTreeMap<String, GeoPosition> = BTreeMap::new();
         let mut line_of = BTreeMap::new();
         for (at, line) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
-            let fields: Vec<&str> = line.split(',').map(|field| unquoted(field.trim())).collect();
             let wrong = |what: &str| {
                 let message = format!("{shown}, line {}: {what}", at + 1);
                 Hinted::error(message, "each line is name,lat,lon,alt in WGS84 degrees and metres")
             };
+            let fields = fields_of(line).ok_or_else(|| wrong(&format!("`{line}` has a quote too many")))?;
+            let fields: Vec<&str> = fields.iter().map(String::as_str).collect();
             let known = match columns {
                 Some(known) => known,
                 None if fields.iter().skip(1).any(|field| field.parse::<f64>().is_ok()) => Columns::UNNAMED,
@@ -103,6 +138,13 @@ impl GeoBook {
                 }
             };
             columns = Some(known);
+            if fields.iter().skip(known.count()).any(|field| !field.is_empty()) {
+                let (found, count) = (fields.len(), known.count());
+                let message =
+                    format!("{shown}, line {}: {found} fields in {count} columns: `{line}`", at + 1);
+                let hint = "write numbers with a decimal point, and names with commas in quotes";
+                return Err(Hinted::error(message, hint));
+            }
             let (name, place) =
                 known.read(&fields).ok_or_else(|| wrong(&format!("`{line}` is no position")))?;
             let first = *line_of.entry(name.clone()).or_insert(at + 1);
@@ -191,11 +233,43 @@ mod tests {
         assert!(said("name,lat,lon,altitude\na,1,2,3\n").contains("unknown column `altitude`"));
         assert!(said("name,lat,alt\na,1,2\n").contains("no column `lon`"));
         assert!(said("name,lat,lon,lat\na,1,2,1\n").contains("two columns `lat`"));
-        for wrong in ["a,4x,8,0", "a,47,,0", "a,47,8,high", "a,47", "a,47,8,nan", "a,91,8,0", ",47,8,0"] {
+        for wrong in [
+            "a,4x,8,0",
+            "a,47,,0",
+            "a,47,8,high",
+            "a,47",
+            "a,47,8,nan",
+            "a,91,8,0",
+            ",47,8,0",
+            "a,47,8,1e300",
+            "\"a,47,8,0",
+        ] {
             assert!(said(&format!("name,lat,lon,alt\n\n{wrong}\n")).contains("line 3: "), "{wrong}");
         }
         for wrong in ["a,4x,8,0", "a,47,8,high", "7,4x,8"] {
             assert!(said(&format!("{wrong}\n")).contains("line 1: "), "{wrong}");
         }
+    }
+
+    #[test]
+    fn names_in_quotes_may_have_commas_and_quotes() {
+        let book = read("name,lat,lon\n\"p, 1/a \"\"b\"\".png\" , 47.25 ,\"8.5\"\n").unwrap();
+        assert_eq!(place(&book, "p, 1/a \"b\".png"), (47.25, 8.5, None));
+        assert_eq!(fields_of("a,\"\",").unwrap(), ["a", "", ""]);
+        assert_eq!(fields_of("\"a\"b,1"), None);
+    }
+
+    #[test]
+    fn decimal_commas_are_refused_with_their_line() {
+        for text in ["name,lat,lon,alt\na.png,47,25,8,5,400\n", "name,lat,lon\na.png,47,8,5\n"] {
+            let error = read(text).unwrap_err();
+            assert!(
+                error.to_string().contains("geo.csv, line 2: ") && error.to_string().contains(" columns")
+            );
+            let hint = error.downcast_ref::<Hinted>().unwrap().hint();
+            assert!(hint.starts_with("write numbers with a decimal point"), "{hint}");
+        }
+        // Spreadsheet programs leave empty columns behind.
+        assert_eq!(place(&read("a.png,47,8,400,,\n").unwrap(), "a.png"), (47.0, 8.0, Some(400.0)));
     }
 }

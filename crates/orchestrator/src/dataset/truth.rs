@@ -7,6 +7,8 @@ use serde::Deserialize;
 use setloc_features::Wgs84;
 use setloc_sfm::Rigid;
 
+use crate::text::read_text;
+
 /// Poses known from elsewhere: east-north-up metres.
 #[derive(Debug, Clone, Default, Deserialize)]
 pub struct Truth {
@@ -49,8 +51,7 @@ impl Truth {
     /// # Errors
     /// With file and line.
     pub fn read(path: &Path) -> Result<Self> {
-        let text =
-            std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let text = read_text(path)?;
         serde_json::from_str(&text).with_context(|| format!("{} is no truth.json", path.display()))
     }
 

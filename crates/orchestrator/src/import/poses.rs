@@ -14,6 +14,7 @@ use super::colmap_text::is_content;
 use crate::colmap::ColmapFormat;
 use crate::dataset::rigid_of;
 use crate::error::Hinted;
+use crate::text::read_text;
 
 /// Poses of images by name.
 #[derive(Debug, Clone, Default)]
@@ -55,8 +56,7 @@ pub fn read_poses(path: &Path) -> Result<NamedPoses> {
         let images = ColmapFormat::of(path)?.images(path, |_| Ok(()))?;
         images.into_iter().map(|(name, (_, pose))| (name, pose)).collect()
     } else {
-        let text =
-            std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let text = read_text(path)?;
         if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
             let json: Value =
                 serde_json::from_str(&text).with_context(|| format!("{} is no JSON", path.display()))?;
