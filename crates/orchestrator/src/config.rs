@@ -4,15 +4,17 @@ mod ranges;
 
 use std::path::Path;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use serde::{Deserialize, Serialize};
 use setloc_camset::{CamsetParams, GrowthParams, SingleParams};
 use setloc_index::IndexParams;
 use setloc_sfm::{AlignmentParams, GeoregisterParams, MapperParams, QualityParams, TwoViewParams};
+use toml::de::DeTable;
 
 use crate::artifacts::LeftApart;
 use crate::error::Hinted;
 use crate::stages::{FeatureParams, MatchParams};
+use crate::text::read_text;
 
 /// Parameters of all stages.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -126,45 +128,49 @@ impl Config {
     /// Defaults, then the file, then `key=value` settings such as `two_view.min_inliers=30`.
     ///
     /// # Errors
-    /// With file, line, key and the allowed names when something is unknown or of the wrong type.
+    /// With file and line or the setting, key, and what is allowed when something is unknown, of the wrong type or out of its range.
     pub fn resolve(file: Option<&Path>, settings: &[String]) -> Result<Self> {
-        let mut table = match file {
-            Some(path) => {
-                let text = std::fs::read_to_string(path)
-                    .with_context(|| format!("cannot read {}", path.display()))?;
-                // Checked on its own first, so that the error shows the line in the file.
-                toml::from_str::<Self>(&text).map_err(|error| {
-                    let error = anyhow::Error::new(error)
-                        .context(format!("{} is not a valid configuration", path.display()));
-                    Hinted::wrap(error, "`setloc build --print-config` lists all keys with their values")
-                })?;
-                toml::from_str::<toml::Table>(&text)?
-            }
-            None => toml::Table::new(),
-        };
+        let text = file.map(read_text).transpose()?.unwrap_or_default();
+        let lists = "`setloc build --print-config` lists all keys with their values";
+        // Checked on its own first, so that the error shows the line in the file.
+        let mut config = toml::from_str::<Self>(&text).map_err(|error| {
+            let shown = file.unwrap_or(Path::new("")).display();
+            let error = anyhow::Error::new(error).context(format!("{shown} is not a valid configuration"));
+            Hinted::wrap(error, lists)
+        })?;
+        let mut table = toml::from_str::<toml::Table>(&text)?;
+        // One by one, so that the error names the setting.
         for setting in settings {
             apply(&mut table, setting)?;
+            config = toml::from_str(&toml::to_string(&table)?).map_err(|error| {
+                Hinted::error(format!("invalid setting `{setting}`: {}", error.message()), lists)
+            })?;
         }
-        let text = toml::to_string(&table)?;
-        let config: Self = toml::from_str(&text).map_err(|error| {
-            let message = format!("invalid setting: {}", error.message());
-            Hinted::error(message, "`setloc build --print-config` lists all keys with their values")
-        })?;
-        config.validate()?;
+        config.check_ranges(file.map(|path| (path, text.as_str())), settings)?;
         Ok(config)
     }
 
-    /// Checks all numbers.
-    ///
-    /// # Errors
-    /// With the key, value and allowed range of each that is out of its range.
-    pub fn validate(&self) -> Result<()> {
+    /// Checks all numbers; with the place that each which is out of its range comes from.
+    fn check_ranges(&self, file: Option<(&Path, &str)>, settings: &[String]) -> Result<()> {
         let violations = ranges::violations(&toml::Table::try_from(self)?);
         if violations.is_empty() {
             return Ok(());
         }
-        let message = format!("invalid setting: {}", violations.join("; "));
-        Err(Hinted::error(message, "`setloc build --print-config` without settings lists the defaults"))
+        let in_words = |(key, what): &(String, String)| {
+            let sets = |setting: &&String| {
+                setting.split_once('=').is_some_and(|(name, _)| name.trim() == key.as_str())
+            };
+            if let Some(setting) = settings.iter().rfind(sets) {
+                return format!("--set {setting}: {what}");
+            }
+            let line = file.and_then(|(path, text)| Some((path.display(), line_of(text, key)?)));
+            line.map_or_else(|| what.clone(), |(path, line)| format!("{path}, line {line}: {what}"))
+        };
+        let violations: Vec<String> = violations.iter().map(in_words).collect();
+        Err(Hinted::error(
+            format!("invalid setting: {}", violations.join("; ")),
+            "`setloc build --print-config` without settings lists the defaults",
+        ))
     }
 
     /// The part that a scene depends on, as TOML: without localization.
@@ -204,6 +210,17 @@ fn apply(table: &mut toml::Table, setting: &str) -> Result<()> {
     Ok(())
 }
 
+/// The line of a key's value, from 1 on.
+fn line_of(text: &str, key: &str) -> Option<usize> {
+    let table = DeTable::parse(text).ok()?;
+    let mut names = key.split('.');
+    let mut value = table.get_ref().get(names.next()?)?;
+    for name in names {
+        value = value.get_ref().get(name)?;
+    }
+    Some(1 + text.get(..value.span().start)?.matches('\n').count())
+}
+
 /// A TOML value; what is none is a string.
 fn parse_value(text: &str) -> toml::Value {
     let parsed = toml::from_str::<toml::Table>(&format!("value = {text}")).ok();
@@ -233,8 +250,11 @@ mod tests {
             error.contains("setloc.toml") && error.contains("line 2") && error.contains("window"),
             "{error}"
         );
-        assert!(Config::resolve(None, &["pairs.windw=3".to_owned()]).is_err());
-        assert!(Config::resolve(None, &["pairs.window=many".to_owned()]).is_err());
+        for setting in ["pairs.windw=3", "pairs.window=many"] {
+            let settings = ["two_view.min_inliers=40".to_owned(), setting.to_owned()];
+            let error = Config::resolve(None, &settings).unwrap_err().to_string();
+            assert!(error.starts_with(&format!("invalid setting `{setting}`: ")), "{error}");
+        }
     }
 
     #[test]
@@ -249,6 +269,21 @@ mod tests {
         ] {
             assert!(error.contains(part), "{error}");
         }
+        assert!(error.contains("--set features.sigma_px=nan: `features.sigma_px` is NaN"), "{error}");
+    }
+
+    #[test]
+    fn numbers_of_a_file_that_are_out_of_range_are_named_with_their_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("setloc.toml");
+        let text =
+            "[features]\nsigma_px = nan\n\n[single]\nguided.ratio = 1.5\n[single.verdict]\nmin_inliers = 1\n";
+        std::fs::write(&path, text).unwrap();
+        let error = Config::resolve(Some(&path), &["single.verdict.min_inliers=9".to_owned()]).unwrap_err();
+        let error = error.to_string().replace(&path.display().to_string(), "setloc.toml");
+        let expected = "invalid setting: setloc.toml, line 2: `features.sigma_px` is NaN, expected 0.5 to 10; \
+                        setloc.toml, line 5: `single.guided.ratio` is 1.5, expected above 0, at most 1";
+        assert_eq!(error, expected);
     }
 
     #[test]

@@ -92,6 +92,15 @@ impl SceneFile {
     /// # Errors
     /// As [`SceneFile::read`].
     pub fn read_with_hash(path: &Path) -> Result<(Self, ContentHash)> {
+        if path.is_dir() {
+            let file = path.with_extension("setloc");
+            let is_there = file.is_file() && file != path;
+            let example = if is_there { format!(", as {}", file.display()) } else { String::new() };
+            return Err(Hinted::error(
+                format!("{} is a folder, and no scene", path.display()),
+                format!("name the file that `setloc build` wrote (-o){example}"),
+            ));
+        }
         let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
         let scene = codec::decode(&bytes).map_err(|error| {
             let error = anyhow::Error::new(error).context(format!("{} is no usable scene", path.display()));
@@ -172,6 +181,20 @@ mod tests {
         assert_eq!([0, 1, 2, 3].map(|component| read.shares_frame(component)), [true, false, true, false]);
         let own = SceneFile { placed: vec![false, false, true], ..scene };
         assert_eq!([0, 1, 2].map(|component| own.shares_frame(component)), [true, false, false]);
+    }
+
+    #[test]
+    fn a_folder_of_exports_is_no_scene_and_the_file_beside_it_is_named() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("s");
+        std::fs::create_dir(&folder).unwrap();
+        std::fs::write(root.path().join("s.setloc"), "").unwrap();
+        let error = SceneFile::read(&folder).unwrap_err();
+        let hint = error.downcast_ref::<Hinted>().unwrap().hint();
+        assert!(
+            error.to_string().ends_with("s is a folder, and no scene") && hint.ends_with("s.setloc"),
+            "{hint}"
+        );
     }
 
     #[test]

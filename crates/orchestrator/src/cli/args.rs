@@ -85,8 +85,8 @@ pub struct RunArgs {
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
     /// Most jobs at once [default: all cores]
-    #[arg(long)]
-    pub threads: Option<usize>,
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..))]
+    pub threads: Option<u16>,
     /// Memory for the jobs' work, as `8GiB` [default: three quarters of the machine's]
     #[arg(long, value_parser = parse_bytes)]
     pub memory: Option<u64>,
@@ -118,9 +118,8 @@ impl RunArgs {
 
     /// Opens the store; the log is a file in `log_folder`.
     pub fn session(&self, output: &Path, log_folder: Option<&Path>) -> Result<Session> {
-        let threads =
-            self.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
-        let threads = threads.max(1);
+        let all_cores = || std::thread::available_parallelism().map_or(1, usize::from);
+        let threads = self.threads.map_or_else(all_cores, usize::from);
         // A pool that exists already, as in a batch, is kept.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
         let limits = Limits {

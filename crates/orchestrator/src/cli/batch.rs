@@ -175,7 +175,9 @@ impl Progress {
 pub fn run(args: &BatchArgs) -> Result<Answer> {
     let manifest = Manifest::read(&args.manifest)?;
     let base = args.manifest.parent().unwrap_or(Path::new(""));
-    let variants = manifest.variants(args.run.config.as_deref(), &args.run.settings)?;
+    let variants = manifest
+        .variants(args.run.config.as_deref(), &args.run.settings)
+        .with_context(|| format!("{} cannot be run", args.manifest.display()))?;
     let parts: usize = manifest.scene.iter().map(|scene| 1 + scene.sets.len()).sum();
     let mut progress = Progress { parts: Vec::new(), total: parts * variants.len(), end: None };
     let cache = args.run.cache.clone().unwrap_or_else(|| args.output.join(".setloc-cache"));

@@ -148,12 +148,12 @@ fn range_of(key: &str) -> Option<Range> {
     RANGES.iter().filter(|(end, _)| fits(end)).max_by_key(|(end, _)| end.len()).map(|&(_, range)| range)
 }
 
-/// Every number in a table that is out of its range, in words.
-pub(super) fn violations(table: &toml::Table) -> Vec<String> {
+/// Every number in a table that is out of its range: its key, and what is wrong in words.
+pub(super) fn violations(table: &toml::Table) -> Vec<(String, String)> {
     let mut found = Vec::new();
     visit(table, "", &mut |key, value| {
         if let Some(range) = range_of(key).filter(|range| !range.holds(value)) {
-            found.push(format!("`{key}` is {value}, expected {range}"));
+            found.push((key.to_owned(), format!("`{key}` is {value}, expected {range}")));
         }
     });
     found
@@ -186,7 +186,7 @@ mod tests {
             keys += 1;
         });
         assert!(keys > 80, "{keys}");
-        assert_eq!(violations(&table), Vec::<String>::new());
+        assert_eq!(violations(&table), []);
     }
 
     #[test]

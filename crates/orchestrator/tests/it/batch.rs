@@ -138,6 +138,9 @@ fn a_wrong_manifest_is_refused_before_anything_runs() {
     let scene = "[[scene]]\nname = \"a\"\npanoramas = [\"p\"]\n";
     refused(&format!("{scene}panorama = 1\n"), &["batch.toml", "line 4", "panorama"]);
     refused(&format!("{scene}{scene}"), &["batch.toml", "`a` is taken"]);
-    refused(&format!("{scene}[sweep]\n\"camset.rato\" = [1]\n"), &["camset.rato=1", "unknown field"]);
+    refused(
+        &format!("{scene}[sweep]\n\"camset.rato\" = [1]\n"),
+        &["batch.toml", "camset.rato=1", "unknown field"],
+    );
     refused("", &["batch.toml", "names no scene"]);
 }

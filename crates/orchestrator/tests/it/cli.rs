@@ -30,17 +30,27 @@ fn errors_name_the_file_the_place_and_the_remedy() {
     write("a.txt", "a.jpg 1 0 0 0 0 0 0\n");
     write("b.txt", "b.jpg 1 0 0 0 0 0 0\n");
     write("batch.toml", "[[scene]]\nname = \"a\"\n");
-    let wrong: [&[&str]; 18] = [
+    write("range.toml", "[camset]\nratio = 1.5\n");
+    write("commas.csv", "name,lat,lon,alt\np0.png,47,25,8,5,400\n");
+    let wrong: [&[&str]; 26] = [
         &["build"],
         &["build", "nowhere"],
         &["build", "empty"],
         &["build", "panoramas", "--config", "config.toml"],
         &["build", "panoramas", "--set", "camset.ratio"],
         &["build", "panoramas", "--set", "camset.rato=1"],
+        &["build", "panoramas", "--set", "camset.ratio=high"],
+        &["build", "panoramas", "--set", "camset.ratio=nan"],
+        &["build", "panoramas", "--config", "range.toml"],
+        &["build", "panoramas", "--config", "empty"],
+        &["build", "panoramas", "--threads", "0"],
+        &["build", "/dev/zero"],
         &["build", "panoramas", "--gps", "geo.csv"],
+        &["build", "panoramas", "--gps", "commas.csv"],
         &["build", "panoramas", "--memory", "8 apples"],
         &["locate", "missing.setloc", "panoramas"],
         &["locate", "damaged.setloc", "panoramas"],
+        &["locate", "empty", "panoramas"],
         &["explain", "features"],
         &["cache", "ls", "--cache", "nowhere"],
         &["report", "empty"],
