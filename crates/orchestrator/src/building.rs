@@ -1,5 +1,7 @@
 //! Builds a scene: from a list of images to the scene file.
 
+mod nothing;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -156,6 +158,8 @@ impl<Export: FnMut(&Built) -> Result<()>> Passes<'_, Export> {
         graph.want(jobs.scene);
         graph.want_file(jobs.scene);
         graph.want(jobs.apart.job);
+        // It tells why nothing is registered.
+        graph.want(jobs.model);
         jobs.finish_only_where(&mut graph, stays);
         jobs.features.iter().for_each(|features| graph.want(*features));
         let (before, export) = (&self.run, &mut self.export);
@@ -344,7 +348,9 @@ fn outcome_of(
         anyhow::bail!("the scene could not be made: {}", reasons.join("; "));
     };
     let carried = said_of_carried(executor, &jobs.carried, &folder.images)?;
-    let warnings: Vec<String> = masked_out(executor, folder, jobs)?.into_iter().chain(carried).collect();
+    let nothing = nothing::why_nothing(executor, jobs, &folder.images)?;
+    let masked = masked_out(executor, folder, jobs)?;
+    let warnings: Vec<String> = nothing.into_iter().chain(masked).chain(carried).collect();
     if present == Some(hash) {
         return Ok(BuildOutcome::Unchanged(run.clone(), skipped, warnings));
     }

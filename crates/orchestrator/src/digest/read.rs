@@ -154,7 +154,6 @@ fn of_scene(name: &str, scene: ScenePoses, skipped: Vec<SkippedImage>) -> Digest
             headline: "No image could be registered.".to_owned(),
             warnings: scene.warnings,
             notes: scene.notes,
-            advice: vec!["take panoramas closer to each other (3 to 10 m)".to_owned()],
             skipped,
             ..Digest::default()
         };

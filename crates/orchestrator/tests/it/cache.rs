@@ -14,7 +14,9 @@ use setloc_orchestrator::locating::{Mode, locate};
 use setloc_orchestrator::session::{Limits, Session};
 use setloc_town::TownParams;
 
-use crate::common::{files_below, logged, panoramas, program, said, setloc, small_town, town, write_picture};
+use crate::common::{
+    files_below, gave, logged, panoramas, program, said, setloc, small_town, town, write_picture,
+};
 
 fn build(store: &Path, panoramas: &Path, config: &Config) -> Box<Built> {
     let limits = Limits { threads: 2, memory: 1 << 30 };
@@ -353,6 +355,8 @@ fn a_build_that_finds_its_scene_made_says_the_same_of_it() {
     for text in [&made, &again] {
         assert!(text.contains("scene: 0/4 images could be registered"), "{text}");
         assert!(text.contains("skipped panoramas/text.jpg: "), "{text}");
+        assert!(text.contains("warning: no image is registered: no two images share enough"), "{text}");
+        assert!(!text.contains("is made again"), "{text}");
     }
     assert!(made.contains("wrote s.setloc and s/") && !made.contains("up to date"), "{made}");
     assert!(again.contains("s.setloc is up to date: nothing changed") && !again.contains("wrote"), "{again}");
@@ -362,4 +366,6 @@ fn a_build_that_finds_its_scene_made_says_the_same_of_it() {
     assert!(!other.contains("up to date"), "{other}");
     let report = std::fs::read_to_string(folder.path().join("s/report.json")).unwrap();
     assert!(report.contains("images of equal content") && report.contains("text.jpg"), "{report}");
+    let report = gave(&setloc(folder.path(), &["report", "s.setloc"]));
+    assert!(report.contains("warning: no image is registered: ") && !report.contains("advice: "), "{report}");
 }
