@@ -3,6 +3,7 @@ use std::path::Path;
 use anyhow::{Context, Result};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
+use serde_json::Value;
 use setloc_camset::Verdict;
 
 use super::{Digest, ImageRow, Standing};
@@ -15,11 +16,34 @@ use crate::text::apart;
 const WEAK_SHARE: f64 = 0.2;
 
 /// `poses.json` of either command.
-#[derive(Deserialize)]
-#[serde(untagged)]
 enum Poses {
     Scene(ScenePoses),
     Located(LocatedPoses),
+}
+
+impl Poses {
+    /// That of the command which it has the keys of.
+    fn read(file: &Path, bytes: &[u8]) -> Result<Self> {
+        let shown = file.display();
+        let damaged = |error: serde_json::Error| {
+            let error = anyhow::Error::new(error).context(format!("{shown} is damaged"));
+            Hinted::wrap(error, "run the command again that wrote it")
+        };
+        let json: Value = serde_json::from_slice(bytes).map_err(damaged)?;
+        if json.get("components").is_some() {
+            return serde_json::from_value(json).map(Self::Scene).map_err(damaged);
+        }
+        if json.get("photos").is_some() {
+            return serde_json::from_value(json).map(Self::Located).map_err(damaged);
+        }
+        let is_of_bench = file.with_file_name("results.json").is_file();
+        let hint = if is_of_bench {
+            "results of `setloc bench` are in the report.html beside it"
+        } else {
+            "name the output folder of `setloc build` or `setloc locate`"
+        };
+        Err(Hinted::error(format!("{shown} holds no results of `build` or `locate`"), hint))
+    }
 }
 
 #[derive(Deserialize)]
@@ -113,11 +137,7 @@ impl Digest {
             let error = anyhow::Error::new(error).context(format!("cannot read {}", file.display()));
             Hinted::wrap(error, "name the output folder of `setloc build` or `setloc locate`")
         })?;
-        let poses = serde_json::from_slice(&bytes).map_err(|error| {
-            let error = anyhow::Error::new(error)
-                .context(format!("{} holds no results of `build` or `locate`", file.display()));
-            Hinted::wrap(error, "run the command again that wrote it")
-        })?;
+        let poses = Poses::read(&file, &bytes)?;
         let file = folder.join("report.json");
         let report = match std::fs::read(&file) {
             Ok(bytes) => serde_json::from_slice(&bytes)
@@ -273,5 +293,33 @@ fn of_photos(name: &str, located: LocatedPoses) -> Digest {
         images,
         skipped: located.skipped,
         ..Digest::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn poses_that_are_damaged_or_of_others_are_told_apart() {
+        let folder = tempfile::tempdir().unwrap();
+        let said = |text: &str| {
+            std::fs::write(folder.path().join("poses.json"), text).unwrap();
+            let error = Digest::read(folder.path()).unwrap_err();
+            let hint =
+                error.chain().find_map(|cause| cause.downcast_ref::<Hinted>()).unwrap().hint().to_owned();
+            (format!("{error:#}"), hint)
+        };
+        let (error, hint) = said("{\"components\": [");
+        assert!(
+            error.contains("poses.json is damaged: EOF") && hint.contains("run the command again"),
+            "{error}"
+        );
+        let (error, _) = said("{\"components\": []}");
+        assert!(error.contains("poses.json is damaged: missing field `warnings`"), "{error}");
+        let (error, hint) = said("{\"a.jpg\": {\"R\": [], \"C\": []}}");
+        assert!(error.contains("holds no results of") && hint.contains("output folder"), "{error} {hint}");
+        std::fs::write(folder.path().join("results.json"), "").unwrap();
+        assert!(said("{}").1.contains("report.html"));
     }
 }
