@@ -41,7 +41,7 @@ pub struct Output<'a> {
 /// Size and contents of a store.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct StoreSummary {
-    /// Per job kind: count and bytes of outputs.
+    /// Per job kind: count and bytes of outputs that are here.
     pub kinds: BTreeMap<String, (usize, u64)>,
     /// Objects that no key refers to.
     pub orphans: usize,
@@ -65,7 +65,7 @@ impl Store {
     /// When the folders cannot be made.
     pub fn open(root: &Path) -> Result<Self> {
         for folder in ["objects", "keys", "runs"] {
-            create_folder(&root.join(folder))?;
+            create_folder(&root.join(folder)).map_err(with_other_store)?;
         }
         Ok(Self::at(root))
     }
@@ -152,6 +152,10 @@ impl Store {
     /// # Errors
     /// When the disk is full or not writable.
     pub fn keep(&self, outputs: &[Output<'_>]) -> Result<()> {
+        self.keep_all(outputs).map_err(with_other_store)
+    }
+
+    fn keep_all(&self, outputs: &[Output<'_>]) -> Result<()> {
         let mut records = Vec::with_capacity(outputs.len());
         for &Output { fingerprint, hash, file, cpu_secs } in outputs {
             let record = KeyRecord::new(fingerprint.clone(), hash, file, cpu_secs);
@@ -238,11 +242,25 @@ impl Store {
     /// When the folders cannot be listed.
     pub fn summary(&self) -> Result<StoreSummary> {
         let mut summary = StoreSummary::default();
+        let mut objects = BTreeSet::new();
+        for path in files_below(&self.root.join("objects"))? {
+            summary.bytes += fs::metadata(&path).map_or(0, |metadata| metadata.len());
+            objects.insert(path.file_name().unwrap_or_default().to_string_lossy().into_owned());
+        }
         let mut used = BTreeSet::new();
         for record in self.records.all()?.into_iter().flat_map(|(_, records)| records) {
-            match record.content() {
-                Some(content) => summary.bytes += content.len() as u64,
-                None => drop(used.insert(record.output.to_string())),
+            let is_here = if let Some(content) = record.content() {
+                summary.bytes += content.len() as u64;
+                true
+            } else {
+                let name = record.output.to_string();
+                let is_here = objects.contains(&name);
+                used.insert(name);
+                is_here
+            };
+            if !is_here {
+                // What is gone is known still, for `explain`.
+                continue;
             }
             let entry = summary.kinds.entry(record.fingerprint.kind).or_default();
             entry.0 += 1;
@@ -251,11 +269,7 @@ impl Store {
         for folder in ["objects", "keys", "runs"] {
             summary.unfinished += temporary_files_below(&self.root.join(folder))?.len();
         }
-        for path in files_below(&self.root.join("objects"))? {
-            summary.bytes += fs::metadata(&path).map_or(0, |metadata| metadata.len());
-            let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-            summary.orphans += usize::from(!used.contains(name));
-        }
+        summary.orphans = objects.difference(&used).count();
         Ok(summary)
     }
 
@@ -564,15 +578,22 @@ fn set_usual_permissions(file: &File) -> std::io::Result<()> {
     file.set_permissions(fs::Permissions::from_mode(0o644))
 }
 
+/// An error of a store with the options that name another one, where this one may not be written.
+fn with_other_store(error: anyhow::Error) -> anyhow::Error {
+    let causes = error.chain().filter_map(|cause| cause.downcast_ref::<std::io::Error>());
+    if causes.map(std::io::Error::kind).any(is_refusal) {
+        return Hinted::wrap(error, "choose a writable folder with --cache DIR or SETLOC_CACHE");
+    }
+    error
+}
+
 /// An error of writing with what to do about it.
 pub fn write_error(error: std::io::Error, path: &Path) -> anyhow::Error {
     let hint = match error.kind() {
         ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
             "make space and run the same command again: everything finished is kept"
         }
-        kind if is_refusal(kind) => {
-            "choose a writable folder with --cache DIR or SETLOC_CACHE, or another -o"
-        }
+        kind if is_refusal(kind) => "choose a folder that can be written, or make this one so",
         _ => "check that the folder exists and can be written",
     };
     Hinted::wrap(anyhow::Error::new(error).context(format!("cannot write {}", path.display())), hint)
@@ -609,6 +630,11 @@ mod tests {
         assert_eq!(files_below(&folder.path().join("objects")).unwrap(), [store.object_path(object)]);
         let summary = store.summary().unwrap();
         assert_eq!((summary.bytes, summary.orphans), (LARGE.len() as u64 + 7, 0));
+        assert_eq!(summary.kinds["test"], (2, LARGE.len() as u64 + 7));
+        // The record of what is gone says what it was, and is no result.
+        store.discard(object);
+        assert_eq!(store.summary().unwrap().kinds["test"], (1, 7));
+        assert!(store.record(fingerprint(2).key()).is_some());
     }
 
     #[test]
