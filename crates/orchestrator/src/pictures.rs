@@ -34,13 +34,15 @@ pub struct PictureFile {
 }
 
 impl PictureBook {
-    /// Of images that are read; with absolute paths where these can be told.
+    /// Of images that are read, with absolute paths where these can be told; without those whose paths are no UTF-8, as which the file
+    /// beside the scene could not be written.
     pub fn of(images: &[SourceImage]) -> Self {
         let file = |image: &SourceImage| {
             let path = std::path::absolute(&image.path).unwrap_or_else(|_| image.path.clone());
-            (image.name.clone(), PictureFile { path, hash: image.hash })
+            path.to_str()?;
+            Some((image.name.clone(), PictureFile { path, hash: image.hash }))
         };
-        Self(images.iter().map(file).collect())
+        Self(images.iter().filter_map(file).collect())
     }
 
     /// Those of a scene; none where nothing says where they were.

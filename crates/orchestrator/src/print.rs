@@ -22,7 +22,8 @@ pub fn data(text: &str) -> Result<()> {
     }
 }
 
-/// A line for people.
+/// A line for people; names in it may have characters that would command their terminal, and are shown without.
 pub fn note(text: &str) {
-    let _ = writeln!(std::io::stderr().lock(), "{text}");
+    let commands = |c: char| c.is_control() && c != '\n' && c != '\t';
+    let _ = writeln!(std::io::stderr().lock(), "{}", text.replace(commands, "_"));
 }

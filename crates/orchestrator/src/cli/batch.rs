@@ -42,8 +42,8 @@ enum Figures {
 
 #[derive(Debug, Clone, Serialize)]
 struct SceneFigures {
-    /// The scene file.
-    scene: PathBuf,
+    /// The scene file, as it is shown.
+    scene: String,
     /// Images that were given.
     images: usize,
     /// Those with a pose in any component.
@@ -56,12 +56,12 @@ struct SceneFigures {
 }
 
 impl SceneFigures {
-    fn of(scene: PathBuf, built: &BuiltScene) -> Self {
+    fn of(scene: &Path, built: &BuiltScene) -> Self {
         let components = &built.scene.components;
         let registered: BTreeSet<ImageId> = components.iter().flat_map(Reconstruction::registered).collect();
         let main = built.scene.main();
         Self {
-            scene,
+            scene: scene.display().to_string(),
             images: built.images,
             registered: registered.len(),
             in_largest: main.map_or(0, |main| main.registered().count()),
@@ -73,8 +73,8 @@ impl SceneFigures {
 
 #[derive(Debug, Clone, Serialize)]
 struct SetFigures {
-    /// The folder of its results.
-    results: PathBuf,
+    /// The folder of its results, as it is shown.
+    results: String,
     /// Photos with an answer.
     photos: usize,
     localized: usize,
@@ -85,7 +85,7 @@ struct SetFigures {
 }
 
 impl SetFigures {
-    fn of(results: PathBuf, found: &LocatedPhotos) -> Self {
+    fn of(results: &Path, found: &LocatedPhotos) -> Self {
         let answers = found.located.answers();
         let count = |verdict| answers.iter().filter(|(_, photo)| photo.verdict == verdict).count();
         let target = answers.iter().find(|(_, photo)| photo.name == found.target);
@@ -98,7 +98,7 @@ impl SetFigures {
             stated
         };
         Self {
-            results,
+            results: results.display().to_string(),
             photos: answers.len(),
             localized: count(Verdict::Localized),
             uncertain: count(Verdict::Uncertain),
@@ -221,7 +221,7 @@ fn run_scene(progress: &mut Progress, entry: &SceneEntry, variant: &Variant, pla
     let to_build = BuildArgs { source, export: None, print_config: false };
     let built = progress.part(name.clone(), || {
         let built = build(&to_build)?;
-        Ok((built.answer, Figures::Scene(SceneFigures::of(scene.clone(), &built))))
+        Ok((built.answer, Figures::Scene(SceneFigures::of(&scene, &built))))
     });
     for set in &entry.sets {
         let set_name = format!("{name}/{}", set.name);
@@ -229,7 +229,7 @@ fn run_scene(progress: &mut Progress, entry: &SceneEntry, variant: &Variant, pla
             let locate = locate_args(set, &scene, &folder, places);
             progress.part(set_name, || {
                 let found = locate_photos(&locate)?;
-                Ok((found.answer, Figures::Set(SetFigures::of(locate.output.clone(), &found))))
+                Ok((found.answer, Figures::Set(SetFigures::of(&locate.output, &found))))
             });
         } else {
             progress.skip(set_name);

@@ -106,6 +106,7 @@ pub(super) fn warnings_of(images: &[SourceImage], given: &Given<'_>) -> Vec<Stri
         masks_of_another_shape(images),
         shared_masks(images),
         equal_images(images),
+        illegible_paths(images),
     ];
     warnings.into_iter().flatten().collect()
 }
@@ -307,6 +308,16 @@ fn equal_images(images: &[SourceImage]) -> Option<String> {
         }
     }
     (!pairs.is_empty()).then(|| format!("images of equal content: {}", some_of(&pairs, "pairs")))
+}
+
+/// Where a scene's images are is noted beside it, as text.
+fn illegible_paths(images: &[SourceImage]) -> Option<String> {
+    let is_illegible =
+        |image: &&SourceImage| std::path::absolute(&image.path).is_ok_and(|path| path.to_str().is_none());
+    let illegible: Vec<String> = images.iter().filter(is_illegible).map(|image| image.name.clone()).collect();
+    let message =
+        "paths are no UTF-8, so that it cannot be noted where these images are (rename their folders)";
+    (!illegible.is_empty()).then(|| format!("{message}: {}", some_of(&illegible, "images")))
 }
 
 #[cfg(test)]

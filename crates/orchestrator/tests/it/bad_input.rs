@@ -1,6 +1,8 @@
 //! The program on bad input: exit codes and what it says.
 
+use std::ffi::OsStr;
 use std::fs::OpenOptions;
+use std::os::unix::ffi::OsStrExt as _;
 
 use crate::common::{gave, panoramas, program, said, setloc, town};
 
@@ -249,6 +251,29 @@ fn a_scene_is_reported_by_no_results_of_another() {
     let text = said(&refused);
     assert!(text.contains("error: s has no results of the scene s.setloc\nhint: "), "{text}");
     assert_eq!(run(&["report", "other"]).status.code(), Some(0));
+}
+
+#[test]
+fn folders_that_are_no_utf_8_are_said_and_lose_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let name = OsStr::from_bytes(b"gr\xfcn");
+    std::fs::rename(panoramas(folder.path(), 2), folder.path().join(name)).unwrap();
+    let output = program(folder.path(), &["build", "-o", "s.setloc"]).arg(name).output().unwrap();
+    let text = said(&output);
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    assert!(text.contains("warning: paths are no UTF-8, so that it cannot be noted where"), "{text}");
+    assert!(
+        text.contains("wrote s.setloc and s/") && folder.path().join("s/report.json").is_file(),
+        "{text}"
+    );
+}
+
+#[test]
+fn names_command_no_terminal() {
+    let folder = tempfile::tempdir().unwrap();
+    panoramas(folder.path(), 2);
+    let text = said(&setloc(folder.path(), &["build", "panoramas", "-o", "s\u{1b}[31m/s.setloc"]));
+    assert!(text.contains("wrote s_[31m/s.setloc") && !text.contains('\u{1b}'), "{text}");
 }
 
 #[test]
