@@ -1,3 +1,4 @@
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::Duration;
 
@@ -92,8 +93,13 @@ pub fn explain(args: &ExplainArgs) -> Result<Answer> {
     if found {
         return Ok(Answer::Done);
     }
-    Err(Hinted::error(
-        format!("no job of the last runs is named like `{}`", args.job),
-        "`setloc plan` lists all jobs",
-    ))
+    let labels: Vec<String> = store.runs()?.into_values().flat_map(|run| run.jobs.into_keys()).collect();
+    let kinds: BTreeSet<&str> = labels.iter().filter_map(|label| Some(label.split_once(' ')?.0)).collect();
+    let hint = if kinds.is_empty() {
+        "no run has come to its end with this store (--cache)".to_owned()
+    } else {
+        let kinds: Vec<&str> = kinds.into_iter().collect();
+        format!("name a kind of job ({}), an image, or both, as `{}`", kinds.join(", "), labels[0])
+    };
+    Err(Hinted::error(format!("no job of the last runs is named like `{}`", args.job), hint))
 }

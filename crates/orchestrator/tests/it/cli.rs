@@ -313,6 +313,9 @@ fn plan_and_explain_name_the_parameter_that_changed() {
         "{explained}"
     );
     assert!(run(&["explain", "features"], &[]).lines().all(|line| line.ends_with(": nothing changed")));
+    let unknown = setloc(folder.path(), &["explain", "nothing"]);
+    assert_eq!(unknown.status.code(), Some(2));
+    assert!(said(&unknown).contains("hint: name a kind of job (aligned, features, "), "{}", said(&unknown));
     // Another output in the same store is another run.
     run(&["build", "town/panoramas", "-o", "other/s.setloc"], &["--cache", ".setloc-cache"]);
     assert!(run(&["explain", "features"], &[]).contains("build other/s.setloc: features"));
