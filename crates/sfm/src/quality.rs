@@ -210,8 +210,8 @@ pub struct QualityReport {
 /// Compares a component with the verified pairs that it and the larger ones were built from.
 ///
 /// `is_underfoot` tells of which pairs paving is all that they explain ([`crate::pairs_underfoot`]), none beyond its end: those agree, or
-/// say nothing. A street's paving repeats itself exactly where it is rendered, and two panoramas far from each other have up to 1600
-/// matches there.
+/// say nothing. A street's paving repeats itself exactly where it is rendered, and two panoramas have up to 1600 matches that take one
+/// row of stones for another.
 pub fn assess(
     params: &QualityParams,
     reconstruction: &Reconstruction,
